@@ -1,0 +1,30 @@
+"""The command line; each command is imported when it is called."""
+
+import importlib
+from collections.abc import Sequence
+
+import click
+
+import toolpost
+
+_COMMANDS = ("demo", "key", "serve", "sim")
+
+
+class _Commands(click.Group):
+    """Finds a command in the module of its name."""
+
+    def list_commands(self, ctx: click.Context) -> Sequence[str]:  # type: ignore[override]  # wider type, same use
+        return _COMMANDS
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in _COMMANDS:
+            return None
+        module = importlib.import_module(f"toolpost.cli.{cmd_name}")
+        command: click.Command = module.command
+        return command
+
+
+@click.group(cls=_Commands)
+@click.version_option(toolpost.__version__, prog_name="toolpost")
+def main() -> None:
+    """Toolpost: a job server for G-code machines."""

@@ -1,0 +1,1 @@
+"""Drivers: one folder per protocol. A driver knows its machine's words and nothing of HTTP."""

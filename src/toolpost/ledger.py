@@ -1,0 +1,189 @@
+"""The jobs of one machine, in memory and on disk.
+
+Decisions are made on what is in memory, at once and on one thread; each of them is handed to the database in
+the same order, and is acknowledged when it is on disk. What the machine itself has done is a fact, whether the
+disk takes it or not: it is written again until it is.
+"""
+
+import asyncio
+import logging
+import secrets
+from collections.abc import Callable, Iterator
+
+from toolpost.clock import now_us
+from toolpost.core.job import Job, JobState, Reason, after_restart
+from toolpost.core.program import Program
+from toolpost.core.queue import active, next_to_start
+from toolpost.errors import StorageError
+from toolpost.store.jobs import JobStore
+
+log = logging.getLogger(__name__)
+
+SYSTEM = "system"
+"""The actor of what Toolpost does by itself."""
+
+_RETRY_AFTER = 1.0
+
+
+class Ledger:
+    """The jobs of one machine.
+
+    Args:
+        machine: its name.
+        store: where jobs are kept.
+        keep_shown: ended jobs that are kept in memory, for lists.
+        keep_stored: jobs that are kept on disk.
+        changed: called with each job once its change is on disk.
+    """
+
+    def __init__(
+        self,
+        machine: str,
+        store: JobStore,
+        *,
+        keep_shown: int,
+        keep_stored: int,
+        changed: Callable[[Job], None],
+    ) -> None:
+        self._machine = machine
+        self._store = store
+        self._keep_shown = keep_shown
+        self._keep_stored = keep_stored
+        self._changed = changed
+        self._jobs: dict[int, Job] = {}
+        self._unsaved: set[int] = set()
+        self._open: dict[int, Job] = {}
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    def load(self, *, load_on_startup: bool) -> None:
+        """Read the jobs from the store; what was under way when the process ended is set right."""
+        for job in self._store.load(self._machine, self._keep_shown):
+            self._put(job)
+            fixed = after_restart(job, load_on_startup=load_on_startup, at_us=now_us())
+            if fixed is not job:
+                self.declare(fixed)
+        self._store.trim(self._machine, self._keep_stored)
+
+    def __iter__(self) -> Iterator[Job]:
+        """Go through the jobs in the order of adding; those that are not on disk yet are left out."""
+        return (job for seq, job in self._jobs.items() if seq not in self._unsaved)
+
+    def get(self, seq: int) -> Job:
+        """Return a job as it is now."""
+        return self._jobs[seq]
+
+    @property
+    def open(self) -> list[Job]:
+        """The jobs that have not ended, those not on disk yet included."""
+        return list(self._open.values())
+
+    @property
+    def active(self) -> Job | None:
+        """The job that holds the machine."""
+        return active(self._open.values())
+
+    @property
+    def next(self) -> Job | None:
+        """The job to start once the machine is ready."""
+        job = next_to_start(self._open.values())
+        return None if job is None or job.seq in self._unsaved else job
+
+    async def add(self, program: Program, signals: dict[str, float], actor: str) -> Job:
+        """Add a job at the end of the queue; it is on disk when this returns.
+
+        Raises:
+            StorageError: it could not be stored, and there is no such job.
+        """
+        seq = self._store.next_seq()
+        job = Job(
+            seq=seq,
+            id=f"{seq:06X}{secrets.token_hex(5).upper()}",
+            machine=self._machine,
+            program=program.sha256,
+            commands=program.commands,
+            signals=signals,
+            created_us=now_us(),
+        )
+        self._put(job)
+        self._unsaved.add(seq)
+        try:
+            await asyncio.shield(self._store.add(job, actor))
+        except StorageError:
+            del self._jobs[seq]
+            self._open.pop(seq, None)
+            raise
+        finally:
+            self._unsaved.discard(seq)
+        job = self._jobs[seq]
+        self._changed(job)
+        return job
+
+    async def change(self, job: Job, actor: str = SYSTEM) -> None:
+        """Make a transition that a machine may rest on; it is on disk when this returns.
+
+        Raises:
+            StorageError: it could not be stored, and the job is as it was.
+        """
+        before = self._jobs[job.seq]
+        self._put(job)
+        try:
+            await asyncio.shield(self._store.update(job, now_us(), actor))
+        except StorageError:
+            if self._jobs[job.seq] is job:
+                self._put(before)
+            raise
+        self._changed(job)
+
+    def declare(self, job: Job, actor: str = SYSTEM) -> "asyncio.Future[None]":
+        """Make a transition that has happened already; the future tells whether the disk took it at once.
+
+        If it did not, it is tried again until it does.
+        """
+        self._put(job)
+        future = self._store.update(job, now_us(), actor)
+        future.add_done_callback(lambda done: self._declared(done, job, actor))
+        return future
+
+    def end_all(self, state: JobState, reason: Reason, actor: str) -> "list[asyncio.Future[None]]":
+        """End every job that has not ended, as `declare`."""
+        at_us = now_us()
+        return [self.declare(job.to(state, reason, at_us), actor) for job in self.open]
+
+    def _declared(self, future: "asyncio.Future[None]", job: Job, actor: str) -> None:
+        if future.cancelled():
+            return
+        if future.exception() is None:
+            self._changed(job)
+            return
+        log.error("%s: job %s: %s; trying again", self._machine, job.id, future.exception())
+        task = asyncio.get_running_loop().create_task(self._declare_again(job, actor))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _declare_again(self, job: Job, actor: str) -> None:
+        while True:
+            await asyncio.sleep(_RETRY_AFTER)
+            try:
+                await self._store.update(job, now_us(), actor)
+            except StorageError:
+                continue
+            log.info("%s: job %s: stored", self._machine, job.id)
+            self._changed(job)
+            return
+
+    def close(self) -> None:
+        """Give up what the disk has not taken."""
+        for task in self._tasks:
+            task.cancel()
+
+    def _put(self, job: Job) -> None:
+        self._jobs[job.seq] = job
+        if not job.ended:
+            self._open[job.seq] = job
+            return
+        self._open.pop(job.seq, None)
+        surplus = len(self._jobs) - len(self._open) - self._keep_shown
+        if surplus > 0:
+            ended = [seq for seq, old in self._jobs.items() if old.ended][:surplus]
+            for seq in ended:
+                del self._jobs[seq]

@@ -1,0 +1,87 @@
+"""The only starter of jobs: one for each machine."""
+
+import asyncio
+import logging
+
+from toolpost.clock import now_us
+from toolpost.core.job import Job, JobState, Reason
+from toolpost.drivers.base import Driver, Ending, Outcome
+from toolpost.errors import StorageError
+from toolpost.ledger import Ledger
+from toolpost.store.programs import ProgramReader, ProgramStore
+
+log = logging.getLogger(__name__)
+
+_RETRY_AFTER = 1.0
+
+
+class Runner:
+    """Starts a machine's next job when the machine is ready for it, and sees it to its end.
+
+    Args:
+        name: name of the machine, for messages.
+        ledger: its jobs.
+        driver: drives it.
+        programs: where the programs are.
+    """
+
+    def __init__(self, name: str, ledger: Ledger, driver: Driver, programs: ProgramStore) -> None:
+        self._name = name
+        self._ledger = ledger
+        self._driver = driver
+        self._programs = programs
+        self._wake = asyncio.Event()
+
+    def wake(self) -> None:
+        """Look whether a job can be started: something has changed."""
+        self._wake.set()
+
+    async def run(self) -> None:
+        """Start jobs until canceled."""
+        while True:
+            self._wake.clear()
+            job = self._ledger.next
+            if job is not None and self._driver.ready:
+                await self._run_job(job)
+            else:
+                await self._wake.wait()
+
+    async def _run_job(self, job: Job) -> None:
+        try:
+            reader = self._programs.open(job.program)
+        except StorageError as error:
+            self._end(job, Ending(Outcome.FAILED, Reason.PROGRAM_MISSING, str(error)))
+            return
+        try:
+            # The intent to start is on disk before the first byte leaves: a start happens at most once.
+            if await self._commit_start(job):
+                await self._execute(job, reader)
+        finally:
+            reader.close()
+
+    async def _commit_start(self, job: Job) -> bool:
+        try:
+            await self._ledger.change(job.to(JobState.PROCESSING, Reason.RUNNING, now_us()))
+        except StorageError as error:
+            log.error("%s: job %s cannot be started: %s", self._name, job.id, error)
+            await asyncio.sleep(_RETRY_AFTER)
+            return False
+        return self._ledger.get(job.seq).state is JobState.PROCESSING
+
+    async def _execute(self, job: Job, reader: ProgramReader) -> None:
+        log.info("%s: job %s started: %d commands", self._name, job.id, job.commands)
+        ending = await self._driver.execute(reader, job.signals)
+        job = self._ledger.get(job.seq)
+        if job.ended:
+            log.info("%s: job %s %s", self._name, job.id, job.state)
+        else:
+            self._end(job, ending)
+
+    def _end(self, job: Job, ending: Ending) -> None:
+        at_us = now_us()
+        if ending.outcome is Outcome.COMPLETED:
+            ended = job.to(JobState.COMPLETED, Reason.DONE, at_us)
+        else:
+            ended = job.to(JobState.ABORTED, ending.reason, at_us, ending.detail)
+        self._ledger.declare(ended)
+        log.info("%s: job %s %s %s", self._name, ended.id, ended.state, ended.detail)

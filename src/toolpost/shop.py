@@ -1,0 +1,252 @@
+"""The one service that every dialect calls: calls and answers are structs, and nothing here knows HTTP."""
+
+import asyncio
+from collections.abc import Iterable, Iterator, Sequence
+
+import msgspec
+
+from toolpost.clock import now_us
+from toolpost.core.job import Job, JobState, Reason
+from toolpost.core.report import Report, Value
+from toolpost.drivers.base import LineKind
+from toolpost.errors import InvalidLineError, InvalidRequestError, NotAcceptedError, StorageError
+from toolpost.machine import Machine
+from toolpost.store import Store
+from toolpost.telemetry import Telemetry
+from toolpost.telemetry.grid import SampleGrid
+
+
+class Status(msgspec.Struct, frozen=True, kw_only=True):
+    """A machine in brief.
+
+    Attributes:
+        time_us: Unix time of this status, microseconds.
+        alive: whether the machine answers.
+        host_commands: commands that Toolpost has still to send, those of waiting jobs included.
+        machine_commands: commands sent that the machine is not known to have executed.
+        running_job: id of the job that holds the machine.
+    """
+
+    time_us: int
+    alive: bool
+    host_commands: int
+    machine_commands: int
+    running_job: str | None
+
+
+class Progress(msgspec.Struct, frozen=True):
+    """How far a job is, in commands: sent, executed, and all there are."""
+
+    sent: int
+    executed: int
+    total: int
+
+
+class Shop:
+    """All machines, and what can be asked of them.
+
+    Args:
+        machines: by name; the first is the default one.
+        store: jobs, programs and settings.
+        telemetry: the reports.
+        programs_bytes: bound of the programs that no job needs.
+    """
+
+    def __init__(
+        self,
+        machines: dict[str, Machine],
+        store: Store,
+        telemetry: Telemetry,
+        programs_bytes: int,
+    ) -> None:
+        self._machines = machines
+        self._programs = store.programs
+        self._telemetry = telemetry
+        self._programs_bytes = programs_bytes
+        self._adding: dict[str, int] = dict.fromkeys(machines, 0)
+        self._cancels: dict[str, int] = dict.fromkeys(machines, 0)
+
+    @property
+    def machines(self) -> list[str]:
+        """The names of all machines, the default one first."""
+        return list(self._machines)
+
+    # Lines
+
+    async def write_line(self, machine: str, text: str, *, urgent: bool | None, actor: str) -> bool:
+        """Send a single line; return whether it was taken.
+
+        A stop cancels everything, as `cancel`. A signal goes ahead of all commands. A command is not taken
+        while a job has not ended, for it would end up in the middle of it, unless it is declared urgent.
+
+        Args:
+            machine: name of the machine.
+            text: the line; a comment in it is not sent.
+            urgent: send ahead of all commands (True), behind them (False), or as the line demands (None).
+            actor: who asks.
+
+        Raises:
+            InvalidRequestError: the line must not go to this machine.
+        """
+        target = self._machines[machine]
+        line = target.driver.line(text)
+        if line.kind is LineKind.STOP:
+            await self.cancel(machine, actor)
+            return True
+        if urgent is None:
+            urgent = line.kind is LineKind.SIGNAL
+        if not urgent and (target.ledger.open or self._adding[machine]):
+            return False
+        if line.kind is LineKind.NOTHING:
+            return True
+        if urgent or line.kind is LineKind.SIGNAL:
+            return target.driver.send_now(line.payload)
+        return target.driver.enqueue(line.payload)
+
+    def check_poll(self, machine: str, text: str) -> str:
+        """Return the line to send at intervals that `text` stands for.
+
+        Raises:
+            InvalidRequestError: it is no line that may be sent again and again.
+        """
+        line = self._machines[machine].driver.line(text)
+        if line.kind in {LineKind.NOTHING, LineKind.STOP}:
+            raise InvalidRequestError("must be a line that may be sent while a job runs")
+        return line.payload.decode("ascii")
+
+    # Jobs
+
+    async def submit(
+        self,
+        machine: str,
+        lines: Iterable[Sequence[str]],
+        signals: dict[str, float],
+        *,
+        actor: str,
+    ) -> Job:
+        """Add a job if no other is waiting or running; it is on disk when this returns.
+
+        Args:
+            machine: name of the machine.
+            lines: the lines of the program, in blocks; gone through in another thread.
+            signals: lines to send while the job runs, with their intervals in seconds.
+            actor: who asks.
+
+        Raises:
+            NotAcceptedError: there is a job that has not ended, or the machine does not answer.
+            InvalidLineError: a line is no command.
+            StorageError: it could not be stored, and there is no such job.
+        """
+        target = self._machines[machine]
+        if target.ledger.open or self._adding[machine]:
+            raise NotAcceptedError("a job has not ended")
+        if not target.driver.accepting:
+            raise NotAcceptedError("the machine does not answer")
+        cancels = self._cancels[machine]
+        self._adding[machine] += 1
+        try:
+            program = await asyncio.to_thread(
+                self._programs.add, _commands(target, lines)
+            )
+            if self._cancels[machine] != cancels:
+                raise NotAcceptedError("everything was canceled meanwhile")
+            job = await target.ledger.add(program, signals, actor)
+        finally:
+            self._adding[machine] -= 1
+        self._trim_programs()
+        return job
+
+    async def cancel(self, machine: str, actor: str) -> None:
+        """Stop a machine and cancel all of its jobs that have not ended.
+
+        The machine is told before this awaits anything; the jobs' end is on disk when it returns.
+
+        Raises:
+            StorageError: all was stopped, but the disk did not take the record of it yet.
+        """
+        target = self._machines[machine]
+        self._cancels[machine] += 1
+        target.driver.stop()
+        records = target.ledger.end_all(JobState.CANCELED, Reason.CANCELED_BY_USER, actor)
+        results = await asyncio.gather(*records, return_exceptions=True)
+        if any(isinstance(result, StorageError) for result in results):
+            raise StorageError("everything was stopped, but the disk did not take the record of it")
+
+    def jobs(self, machine: str) -> list[Job]:
+        """Return a machine's jobs in the order of adding."""
+        return list(self._machines[machine].ledger)
+
+    def progress(self, job: Job) -> Progress:
+        """Return how far a job is; of an ended job only the completed one is known to the end."""
+        if job.state is JobState.PROCESSING:
+            state = self._machines[job.machine].driver.state
+            executed = max(0, state.job_sent - state.machine_commands)
+            return Progress(state.job_sent, executed, job.commands)
+        done = job.commands if job.state is JobState.COMPLETED else 0
+        return Progress(done, done, job.commands)
+
+    def status(self, machine: str) -> Status:
+        """Return a machine in brief."""
+        target = self._machines[machine]
+        state = target.driver.state
+        host_commands = state.waiting_commands
+        for job in target.ledger.open:
+            if job.state is JobState.PROCESSING:
+                host_commands += job.commands - state.job_sent
+            elif job.state is not JobState.PROCESSING_STOPPED:
+                host_commands += job.commands
+        active = target.ledger.active
+        return Status(
+            time_us=now_us(),
+            alive=state.alive,
+            host_commands=host_commands,
+            machine_commands=state.machine_commands,
+            running_job=active.id if active is not None else None,
+        )
+
+    # Init lines
+
+    def init_lines(self, machine: str) -> list[str]:
+        """Return the lines that make a machine ready after its boot."""
+        return self._machines[machine].init_lines
+
+    async def set_init_lines(self, machine: str, lines: list[str]) -> None:
+        """Set the init lines; they are on disk when this returns.
+
+        Blank lines are left out, comments are kept.
+
+        Raises:
+            InvalidLineError: a line is no command.
+            StorageError: they could not be stored, and the old ones still hold.
+        """
+        target = self._machines[machine]
+        target.driver.commands(lines)
+        await target.set_init_lines([line.strip() for line in lines if line.strip()])
+
+    # Telemetry
+
+    async def reports(self, machine: str, tag: str, count: int) -> list[Report]:
+        """Return the latest reports of a tag, the latest first."""
+        return await self._telemetry.history(machine, tag, count)
+
+    async def query(
+        self, machine: str, keys: Sequence[str], grid: SampleGrid
+    ) -> dict[str, list[Value]]:
+        """Return the series named ``tag.key``, sampled at the times of `grid`."""
+        return await self._telemetry.query(machine, keys, grid)
+
+    def _trim_programs(self) -> None:
+        if any(self._adding.values()):
+            return
+        in_use = {job.program for m in self._machines.values() for job in m.ledger.open}
+        self._programs.trim(in_use, self._programs_bytes)
+
+
+def _commands(target: Machine, lines: Iterable[Sequence[str]]) -> Iterator[list[bytes]]:
+    done = 0
+    for block in lines:
+        try:
+            yield target.driver.commands(block)
+        except InvalidLineError as error:
+            raise InvalidLineError(done + error.index, error.problem) from None
+        done += len(block)

@@ -1,0 +1,31 @@
+"""What must outlive the process: jobs, programs, settings and keys."""
+
+from pathlib import Path
+
+from toolpost.store.database import Database
+from toolpost.store.jobs import JobStore
+from toolpost.store.keys import KeyStore
+from toolpost.store.programs import ProgramStore
+from toolpost.store.settings import SettingStore
+
+
+class Store:
+    """All that is stored under a data directory but telemetry and logs.
+
+    Args:
+        directory: the data directory, which must exist.
+
+    Raises:
+        StartError: the database cannot be opened.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self._database = Database(directory / "toolpost.db")
+        self.jobs = JobStore(self._database)
+        self.settings = SettingStore(self._database)
+        self.keys = KeyStore(self._database)
+        self.programs = ProgramStore(directory / "programs")
+
+    def close(self) -> None:
+        """Make durable what is queued and close."""
+        self._database.close()

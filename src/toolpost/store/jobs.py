@@ -1,0 +1,88 @@
+"""Jobs and their events in the database."""
+
+import asyncio
+import sqlite3
+from typing import Any
+
+import msgspec
+
+from toolpost.core.job import Job
+from toolpost.store.database import QUERIES, Database
+
+
+class JobStore:
+    """The table of jobs, with one event for each transition.
+
+    Args:
+        database: where it is.
+    """
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self._last_seq = int(database.read("last_seq")[0][0])
+
+    def next_seq(self) -> int:
+        """Return a sequence number that no job has had or will have."""
+        self._last_seq += 1
+        return self._last_seq
+
+    def add(self, job: Job, actor: str) -> "asyncio.Future[None]":
+        """Store a new job; the future is done when it is on disk, or fails with StorageError."""
+
+        def apply(connection: sqlite3.Connection) -> None:
+            connection.execute(QUERIES["insert_job"], _row(job))
+            connection.execute(QUERIES["insert_event"], _event(job, job.created_us, actor))
+
+        return self._database.submit(apply)
+
+    def update(self, job: Job, at_us: int, actor: str) -> "asyncio.Future[None]":
+        """Store a job's transition, as `add`."""
+
+        def apply(connection: sqlite3.Connection) -> None:
+            connection.execute(QUERIES["update_job"], _row(job))
+            connection.execute(QUERIES["insert_event"], _event(job, at_us, actor))
+
+        return self._database.submit(apply)
+
+    def trim(self, machine: str, keep: int) -> "asyncio.Future[None]":
+        """Delete the oldest ended jobs of a machine but the `keep` newest jobs."""
+
+        def apply(connection: sqlite3.Connection) -> None:
+            connection.execute(QUERIES["trim_jobs"], {"machine": machine, "keep": keep})
+
+        return self._database.submit(apply)
+
+    def load(self, machine: str, most: int) -> list[Job]:
+        """Return a machine's jobs in the order of adding: the newest `most`, and all that have not ended."""
+        rows = self._database.read("newest_jobs", machine=machine, most=most)
+        rows += self._database.read("jobs_not_ended", machine=machine)
+        jobs = {row[0]: _job(row) for row in rows}
+        return [jobs[seq] for seq in sorted(jobs)]
+
+    def programs_in_use(self) -> set[str]:
+        """Return the hashes of the programs that jobs not ended refer to."""
+        return {row[0] for row in self._database.read("programs_in_use")}
+
+
+def _row(job: Job) -> dict[str, Any]:
+    row = msgspec.structs.asdict(job)
+    row["signals"] = msgspec.json.encode(job.signals).decode()
+    row["state"], row["reason"] = job.state.value, job.reason.value
+    return row
+
+
+def _job(row: tuple[Any, ...]) -> Job:
+    values = dict(zip(Job.__struct_fields__, row, strict=True))
+    values["signals"] = msgspec.json.decode(values["signals"])
+    return msgspec.convert(values, Job)
+
+
+def _event(job: Job, time_us: int, actor: str) -> dict[str, Any]:
+    return {
+        "job": job.seq,
+        "time_us": time_us,
+        "actor": actor,
+        "state": job.state.value,
+        "reason": job.reason.value,
+        "detail": job.detail,
+    }

@@ -1,0 +1,134 @@
+"""Programs on disk: one immutable file for each content, named by its hash."""
+
+import hashlib
+import os
+import secrets
+from collections.abc import Iterable
+from pathlib import Path
+
+from toolpost.core.program import Program
+from toolpost.errors import StorageError
+
+_READ_SIZE = 256 * 1024
+_TRIM_TO = 0.9
+
+
+class ProgramStore:
+    """The folder of programs.
+
+    A program's file holds one command a line, each ending in LF, just as they go on the wire.
+
+    Args:
+        directory: where the files are; made if missing.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self._directory = directory
+        directory.mkdir(parents=True, exist_ok=True)
+        for left_over in directory.glob("*.part"):
+            left_over.unlink(missing_ok=True)
+        self._total = sum(path.stat().st_size for path in directory.iterdir())
+
+    def add(self, blocks: Iterable[list[bytes]]) -> Program:
+        """Store commands and return their program; it is on disk when this returns. Blocks; for a thread.
+
+        Raises:
+            StorageError: the disk did not take it.
+        """
+        part = self._directory / f"{secrets.token_hex(8)}.part"
+        try:
+            with part.open("wb") as file:
+                digest = hashlib.sha256()
+                commands = 0
+                for block in blocks:
+                    if not block:
+                        continue
+                    data = b"\n".join(block) + b"\n"
+                    commands += len(block)
+                    digest.update(data)
+                    file.write(data)
+                file.flush()
+                size = file.tell()
+                os.fsync(file.fileno())
+            program = Program(digest.hexdigest(), commands, size)
+            self._total += size
+            part.rename(self._path(program.sha256))
+            _sync_directory(self._directory)
+        except OSError as error:
+            raise StorageError(f"the program could not be stored: {error.strerror}") from None
+        finally:
+            part.unlink(missing_ok=True)
+        return program
+
+    def open(self, sha256: str) -> "ProgramReader":
+        """Return a reader of a program.
+
+        Raises:
+            StorageError: there is no such program, or it cannot be read.
+        """
+        try:
+            return ProgramReader(self._path(sha256))
+        except OSError as error:
+            raise StorageError(f"program {sha256[:12]} cannot be read: {error.strerror}") from None
+
+    def trim(self, in_use: set[str], max_bytes: int) -> None:
+        """Delete the oldest programs that no job needs, if all together are larger than `max_bytes`."""
+        if self._total <= max_bytes:
+            return
+        files = [(path, path.stat()) for path in self._directory.iterdir() if path.suffix != ".part"]
+        self._total = sum(stat.st_size for _, stat in files)
+        for path, stat in sorted(files, key=lambda file: file[1].st_mtime):
+            if self._total <= max_bytes * _TRIM_TO:
+                return
+            if path.name not in in_use:
+                path.unlink(missing_ok=True)
+                self._total -= stat.st_size
+
+    def _path(self, sha256: str) -> Path:
+        return self._directory / sha256
+
+
+class ProgramReader:
+    """Reads a program's commands in order, a block of the file at a time."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("rb", buffering=0)
+        self._commands: list[bytes] = []
+        self._next = 0
+        self._cut = b""
+        self._ended = False
+        os.posix_fadvise(self._file.fileno(), 0, 0, os.POSIX_FADV_SEQUENTIAL)
+        self._read()
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether all commands have been taken."""
+        return self._ended and self._next >= len(self._commands)
+
+    def take(self, most: int) -> list[bytes]:
+        """Return the next commands, at most `most`; an empty list only after the last one."""
+        taken = self._commands[self._next : self._next + most]
+        self._next += len(taken)
+        if self._next >= len(self._commands) and not self._ended:
+            self._read()
+        return taken
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def _read(self) -> None:
+        self._commands, self._next = [], 0
+        while not self._commands and not self._ended:
+            data = self._file.read(_READ_SIZE)
+            self._ended = len(data) == 0
+            self._commands = (self._cut + data).split(b"\n")
+            self._cut = self._commands.pop()
+
+
+def _sync_directory(directory: Path) -> None:
+    fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
