@@ -13,6 +13,7 @@ from msgspec import Meta
 from toolpost.commlog import CommLogLimits
 from toolpost.drivers.spark.options import SparkOptions
 from toolpost.errors import ConfigError
+from toolpost.sim.faults import Fault
 from toolpost.sim.spark import SparkOptions as SimulatedSparkOptions
 from toolpost.telemetry.limits import Limits as TelemetryLimits
 
@@ -81,6 +82,18 @@ class SpoolerConfig(_Table, frozen=True, kw_only=True):
     failed: Literal["FAILED", "CANCELED"] = "FAILED"
 
 
+class SimulatedSparkConfig(SimulatedSparkOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The simulated core of a machine whose link is ``sim``.
+
+    Attributes:
+        baud: speed of its wire, bits per second; without it, no limit.
+        faults: what shall go wrong, as ``toolpost sim spark --fault`` takes it.
+    """
+
+    baud: Positive | None = None
+    faults: tuple[str, ...] = ()
+
+
 class MachineConfig(_Table, frozen=True, kw_only=True):
     """One machine.
 
@@ -102,7 +115,7 @@ class MachineConfig(_Table, frozen=True, kw_only=True):
     history: HistoryConfig = HistoryConfig()
     spooler: SpoolerConfig = SpoolerConfig()
     spark: SparkOptions = SparkOptions()
-    sim: SimulatedSparkOptions = SimulatedSparkOptions()
+    sim: SimulatedSparkConfig = SimulatedSparkConfig()
     log: CommLogLimits = CommLogLimits()
 
 
@@ -181,8 +194,7 @@ def parse(tree: dict[str, Any]) -> Config:
         storage=_convert(tree.get("storage", {}), StorageConfig, "storage"),
         telemetry=_convert(tree.get("telemetry", {}), TelemetryLimits, "telemetry"),
         machines={
-            name: _convert(table, MachineConfig, f"machines.{name}")
-            for name, table in machines.items()
+            name: _convert(table, MachineConfig, f"machines.{name}") for name, table in machines.items()
         },
     )
     _check(config)
@@ -258,10 +270,14 @@ def _check(config: Config) -> None:
         machine_addresses(name, machine)
         if machine.driver not in DRIVERS:
             raise ConfigError(
-                f"{key}.driver: {machine.driver!r} is not to be had; this version drives "
-                f"{', '.join(DRIVERS)}"
+                f"{key}.driver: {machine.driver!r} is not to be had; this version drives {', '.join(DRIVERS)}"
             )
         _check_link(machine.link, f"{key}.link")
+        for fault in machine.sim.faults:
+            try:
+                Fault.parse(fault)
+            except ValueError as error:
+                raise ConfigError(f"{key}.sim.faults: {error}") from None
 
 
 def _check_link(link: str, key: str) -> None:

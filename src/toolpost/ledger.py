@@ -1,14 +1,15 @@
 """The jobs of one machine, in memory and on disk.
 
-Decisions are made on what is in memory, at once and on one thread; each of them is handed to the database in
-the same order, and is acknowledged when it is on disk. What the machine itself has done is a fact, whether the
-disk takes it or not: it is written again until it is.
+Decisions are made on what is in memory, at once and on one thread; each of them is handed to the database
+in the same order, and is acknowledged when it is on disk. What the machine itself has done is a fact,
+whether the disk takes it or not: it is written again until it is.
 """
 
 import asyncio
 import logging
 import secrets
 from collections.abc import Callable, Iterator
+from functools import partial
 
 from toolpost.clock import now_us
 from toolpost.core.job import Job, JobState, Reason, after_restart
@@ -53,7 +54,8 @@ class Ledger:
         self._jobs: dict[int, Job] = {}
         self._unsaved: set[int] = set()
         self._open: dict[int, Job] = {}
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._debts: dict[int, tuple[Job, str]] = {}
+        self._retry: asyncio.TimerHandle | None = None
 
     def load(self, *, load_on_startup: bool) -> None:
         """Read the jobs from the store; what was under way when the process ended is set right."""
@@ -106,6 +108,7 @@ class Ledger:
         )
         self._put(job)
         self._unsaved.add(seq)
+        self._pay_debts()
         try:
             await asyncio.shield(self._store.add(job, actor))
         except StorageError:
@@ -126,6 +129,7 @@ class Ledger:
         """
         before = self._jobs[job.seq]
         self._put(job)
+        self._pay_debts()
         try:
             await asyncio.shield(self._store.update(job, now_us(), actor))
         except StorageError:
@@ -137,44 +141,47 @@ class Ledger:
     def declare(self, job: Job, actor: str = SYSTEM) -> "asyncio.Future[None]":
         """Make a transition that has happened already; the future tells whether the disk took it at once.
 
-        If it did not, it is tried again until it does.
+        If it did not, it is tried again until it does, and always before what is stored later.
         """
         self._put(job)
-        future = self._store.update(job, now_us(), actor)
-        future.add_done_callback(lambda done: self._declared(done, job, actor))
-        return future
+        self._pay_debts()
+        return self._submit(job, actor)
 
     def end_all(self, state: JobState, reason: Reason, actor: str) -> "list[asyncio.Future[None]]":
         """End every job that has not ended, as `declare`."""
         at_us = now_us()
         return [self.declare(job.to(state, reason, at_us), actor) for job in self.open]
 
-    def _declared(self, future: "asyncio.Future[None]", job: Job, actor: str) -> None:
+    def _submit(self, job: Job, actor: str) -> "asyncio.Future[None]":
+        future = self._store.update(job, now_us(), actor)
+        future.add_done_callback(partial(self._submitted, job, actor))
+        return future
+
+    def _submitted(self, job: Job, actor: str, future: "asyncio.Future[None]") -> None:
         if future.cancelled():
             return
-        if future.exception() is None:
+        error = future.exception()
+        if error is None:
             self._changed(job)
             return
-        log.error("%s: job %s: %s; trying again", self._machine, job.id, future.exception())
-        task = asyncio.get_running_loop().create_task(self._declare_again(job, actor))
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        log.error("%s: job %s: %s; trying again", self._machine, job.id, error)
+        self._debts[job.seq] = (job, actor)
+        if self._retry is None:
+            self._retry = asyncio.get_running_loop().call_later(_RETRY_AFTER, self._pay_debts)
 
-    async def _declare_again(self, job: Job, actor: str) -> None:
-        while True:
-            await asyncio.sleep(_RETRY_AFTER)
-            try:
-                await self._store.update(job, now_us(), actor)
-            except StorageError:
-                continue
-            log.info("%s: job %s: stored", self._machine, job.id)
-            self._changed(job)
-            return
+    def _pay_debts(self) -> None:
+        """Hand to the disk again what it has not taken."""
+        if self._retry is not None:
+            self._retry.cancel()
+            self._retry = None
+        debts, self._debts = self._debts, {}
+        for job, actor in debts.values():
+            self._submit(job, actor)
 
     def close(self) -> None:
         """Give up what the disk has not taken."""
-        for task in self._tasks:
-            task.cancel()
+        if self._retry is not None:
+            self._retry.cancel()
 
     def _put(self, job: Job) -> None:
         self._jobs[job.seq] = job

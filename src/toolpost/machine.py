@@ -9,8 +9,8 @@ from toolpost.config import MachineConfig
 from toolpost.core.job import Job, JobState, Reason
 from toolpost.core.machine import Execution
 from toolpost.core.report import Report
-from toolpost.drivers.registry import open_driver
 from toolpost.drivers.base import Driver
+from toolpost.drivers.registry import open_driver
 from toolpost.events import Events, JobChanged, MachineChanged, Reported
 from toolpost.ledger import Ledger
 from toolpost.runner import Runner

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import msgspec
 
 from toolpost.clock import now_us
+from toolpost.core.grid import SampleGrid
 from toolpost.core.job import Job, JobState, Reason
 from toolpost.core.report import Report, Value
 from toolpost.drivers.base import LineKind
@@ -13,7 +14,6 @@ from toolpost.errors import InvalidLineError, InvalidRequestError, NotAcceptedEr
 from toolpost.machine import Machine
 from toolpost.store import Store
 from toolpost.telemetry import Telemetry
-from toolpost.telemetry.grid import SampleGrid
 
 
 class Status(msgspec.Struct, frozen=True, kw_only=True):
@@ -145,9 +145,7 @@ class Shop:
         cancels = self._cancels[machine]
         self._adding[machine] += 1
         try:
-            program = await asyncio.to_thread(
-                self._programs.add, _commands(target, lines)
-            )
+            program = await asyncio.to_thread(self._programs.add, _commands(target, lines))
             if self._cancels[machine] != cancels:
                 raise NotAcceptedError("everything was canceled meanwhile")
             job = await target.ledger.add(program, signals, actor)
@@ -229,9 +227,7 @@ class Shop:
         """Return the latest reports of a tag, the latest first."""
         return await self._telemetry.history(machine, tag, count)
 
-    async def query(
-        self, machine: str, keys: Sequence[str], grid: SampleGrid
-    ) -> dict[str, list[Value]]:
+    async def query(self, machine: str, keys: Sequence[str], grid: SampleGrid) -> dict[str, list[Value]]:
         """Return the series named ``tag.key``, sampled at the times of `grid`."""
         return await self._telemetry.query(machine, keys, grid)
 

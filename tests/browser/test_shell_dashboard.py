@@ -18,8 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from harness import StaticSite, Toolpost, Watch, free_port, port_taken
 from playwright.sync_api import Browser, Error, Locator, Page, expect
+
+from harness import StaticSite, Toolpost, Watch, free_port, port_taken
 
 pytestmark = pytest.mark.browser
 
@@ -217,7 +218,8 @@ def server(
     try:
         yield server
         assert server.stop() == 0
-        assert "Traceback" not in "\n".join(server.output)
+        output = "\n".join(server.output)
+        assert "Traceback" not in output, output
     finally:
         server.kill()
 

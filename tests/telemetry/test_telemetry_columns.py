@@ -59,7 +59,7 @@ def test_whole_numbers_are_integers_and_others_floats():
     ("items", "size"),
     [
         ([7.25] * 1_000, 0),
-        ([0.001 * n for n in range(0, 250)], 1),
+        ([0.001 * n for n in range(250)], 1),
         ([20 + n / 1_000 for n in range(1_000)], 2),
         ([float(n * n) for n in range(1_000)], 4),
         ([1.0 / 3] * 7 + [math.pi], 8),

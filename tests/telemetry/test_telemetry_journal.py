@@ -4,8 +4,7 @@ import os
 import msgspec
 import pytest
 
-from toolpost.telemetry.journal import Journal
-from toolpost.telemetry.journal import Block
+from toolpost.telemetry.journal import Block, Journal
 from toolpost.telemetry.shape import Shape, ShapeDef
 
 SHAPE = Shape(1, ShapeDef("m", "t", ("a", "b"), "ns"))
@@ -121,7 +120,7 @@ def test_rewrite(tmp_path, monkeypatch):
     journal.append([block(9)])
     journal.close()
     assert [b.first for b in content(path)] == [7, 8, 9]
-    assert os.listdir(tmp_path) == ["j"]
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_valid_frame_of_something_else_ends_the_journal(tmp_path):

@@ -1,7 +1,6 @@
 """The command line; each command is imported when it is called."""
 
 import importlib
-from collections.abc import Sequence
 
 import click
 
@@ -13,10 +12,10 @@ _COMMANDS = ("demo", "key", "serve", "sim")
 class _Commands(click.Group):
     """Finds a command in the module of its name."""
 
-    def list_commands(self, ctx: click.Context) -> Sequence[str]:  # type: ignore[override]  # wider type, same use
-        return _COMMANDS
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002  # as the base class has it
+        return list(_COMMANDS)
 
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002  # as above
         if cmd_name not in _COMMANDS:
             return None
         module = importlib.import_module(f"toolpost.cli.{cmd_name}")

@@ -10,9 +10,8 @@ import click
 import msgspec
 
 from toolpost.cli.common import fail, run
-from toolpost.config import Address, Config, MachineConfig
+from toolpost.config import Address, Config, MachineConfig, SimulatedSparkConfig
 from toolpost.errors import ToolpostError
-from toolpost.sim.spark import SparkOptions
 
 _LOOK_EVERY = 0.1
 _COMMAND_TIME = 0.001
@@ -23,7 +22,7 @@ _COMMAND_TIME = 0.001
     "--size", default=6000, show_default=True, type=click.IntRange(min=10), help="Commands, roughly."
 )
 def command(size: int) -> None:
-    """Run a program as a CAM writes it on a simulated EDM machine; ends with status 0 when it is completed."""
+    """Run a program as a CAM writes it on a simulated machine; status 0 means that it was completed."""
     logging.basicConfig(level=logging.ERROR)
     run(lambda: _demo(size))
 
@@ -32,17 +31,16 @@ async def _demo(size: int) -> None:
     from toolpost.app import App
     from toolpost.sim.sample import sample_program
 
-    simulated = SparkOptions(command_time=_COMMAND_TIME)
+    simulated = SimulatedSparkConfig(command_time=_COMMAND_TIME)
     config = Config(machines={"edm": MachineConfig(driver="spark", link="sim", sim=simulated)})
     with tempfile.TemporaryDirectory(prefix="toolpost-demo-") as data:
         app = App(config, Path(data), [Address("127.0.0.1", 0)])
-        ready: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-        serving = asyncio.create_task(app.run(ready.set_result))
-        await asyncio.wait([serving, ready], return_when=asyncio.FIRST_COMPLETED)
-        if not ready.done():
-            await serving
+        urls: asyncio.Queue[str] = asyncio.Queue()
+        serving = asyncio.create_task(app.run(urls.put_nowait))
+        serving.add_done_callback(lambda _: urls.put_nowait(""))
+        url = await urls.get()
         try:
-            status = await _run_job(ready.result(), sample_program(size))
+            status = await _run_job(url, sample_program(size)) if url else ""
         finally:
             app.stop()
             await serving

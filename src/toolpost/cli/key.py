@@ -54,7 +54,6 @@ def delete(name: str, data: Path) -> None:
 
 def _with_keys(data: Path, call: Callable[[KeyStore], Awaitable[T]]) -> T:
     async def run() -> T:
-        data.mkdir(parents=True, exist_ok=True)
         database = Database(data / "toolpost.db")
         try:
             return await call(KeyStore(database))
@@ -62,6 +61,9 @@ def _with_keys(data: Path, call: Callable[[KeyStore], Awaitable[T]]) -> T:
             database.close()
 
     try:
+        data.mkdir(parents=True, exist_ok=True)
         return asyncio.run(run())
+    except OSError as error:
+        fail(f"data directory {data}: {error.strerror}")
     except ToolpostError as error:
         fail(error)

@@ -18,9 +18,7 @@ def command() -> None:
 @command.command()
 @click.option("--link", type=click.Path(path_type=Path), help="A path for a symlink to the pty.")
 @click.option("--capacity", default=64, show_default=True, help="Commands that its queue holds.")
-@click.option(
-    "--command-time", default=0.05, show_default=True, help="Seconds that each command takes."
-)
+@click.option("--command-time", default=0.05, show_default=True, help="Seconds that each command takes.")
 @click.option("--realtime", is_flag=True, help="Moves take the time of their distance and feed.")
 @click.option("--answer-delay", default=0.0, show_default=True, help="Seconds until an answer is sent.")
 @click.option(

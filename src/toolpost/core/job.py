@@ -47,9 +47,7 @@ _S: Final = JobState
 _NEXT: Final[dict[JobState, frozenset[JobState]]] = {
     _S.PENDING: frozenset({_S.PENDING, _S.PENDING_HELD, _S.PROCESSING, _S.CANCELED, _S.ABORTED}),
     _S.PENDING_HELD: frozenset({_S.PENDING, _S.CANCELED, _S.ABORTED}),
-    _S.PROCESSING: frozenset(
-        {_S.PENDING, _S.PROCESSING_STOPPED, _S.CANCELED, _S.ABORTED, _S.COMPLETED}
-    ),
+    _S.PROCESSING: frozenset({_S.PENDING, _S.PROCESSING_STOPPED, _S.CANCELED, _S.ABORTED, _S.COMPLETED}),
     _S.PROCESSING_STOPPED: frozenset({_S.PROCESSING, _S.CANCELED, _S.ABORTED}),
     _S.CANCELED: frozenset(),
     _S.ABORTED: frozenset(),

@@ -68,8 +68,9 @@ class DriverListener(Protocol):
 
 
 class Driver(Protocol):
-    """One machine, driven. All methods are called on the event loop and none of them waits for the machine,
-    but `run`, which keeps the link for as long as it is not canceled, and `execute`.
+    """One machine, driven.
+
+    All methods are called on the event loop, and only the coroutines wait for the machine.
     """
 
     @property

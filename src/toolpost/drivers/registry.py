@@ -10,9 +10,7 @@ from toolpost.drivers.spark.driver import SparkDriver
 from toolpost.links.base import Opener
 
 
-def open_driver(
-    name: str, config: MachineConfig, comm: CommLog, listener: DriverListener
-) -> Driver:
+def open_driver(name: str, config: MachineConfig, comm: CommLog, listener: DriverListener) -> Driver:
     """Return the driver of a machine; it opens its link once it runs."""
     return SparkDriver(name, _opener(config), comm, listener, config.spark)
 

@@ -1,8 +1,8 @@
 """Who may come in: the checks that every request passes before a dialect sees it.
 
 Browsers are the danger on a loopback listener: a page of any site may send requests to it, and a hostile
-name server may make its own name point here. So the ``Host`` must be a name of this server, and an ``Origin``,
-where there is one, must be allowed. On any other listener a key is required as well; an address is never
+name server may make its own name point here. So the ``Host`` must be a name of this server, and an
+``Origin``, where there is one, must be allowed. On any other listener a key is required as well; an address is never
 taken for an identity, except for networks that the configuration opens in so many words.
 """
 
@@ -115,7 +115,7 @@ class Gate:
             found = self._remember((host, origin), allowed)
         return found
 
-    def _remember(self, key: tuple[bytes, bytes | None], allowed: bool) -> bool:  # noqa: FBT001
+    def _remember(self, key: tuple[bytes, bytes | None], allowed: bool) -> bool:
         if len(self._allowed) > 256:
             self._allowed.clear()
         self._allowed[key] = allowed
@@ -200,7 +200,7 @@ def _read_headers(
     return host, origin, key, content_type, browser
 
 
-def _is_simple(content_type: bytes | None, browser: bool) -> bool:  # noqa: FBT001
+def _is_simple(content_type: bytes | None, browser: bool) -> bool:
     """Whether a browser would send this without a preflight (Fetch standard, CORS-safelisted)."""
     if content_type is None:
         return browser

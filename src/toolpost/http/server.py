@@ -86,6 +86,7 @@ class Listener(uvicorn.Server):
         self._address = address
         self._socket = bind(address)
         self._task: asyncio.Task[None] | None = None
+        self._ready = asyncio.Event()
 
     @property
     def url(self) -> str:
@@ -96,8 +97,12 @@ class Listener(uvicorn.Server):
     async def open(self) -> None:
         """Begin to answer; requests are taken when this returns."""
         self._task = asyncio.create_task(self.serve([self._socket]), name=f"listener {self.url}")
-        while not self.started and not self._task.done():
-            await asyncio.sleep(0.001)
+        await self._ready.wait()
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Say that requests are taken."""
+        await super().startup(sockets)
+        self._ready.set()
 
     async def close(self) -> None:
         """Take no more requests, finish those under way and close."""

@@ -2,21 +2,24 @@
 
 import asyncio
 
+from toolpost.config import SimulatedSparkConfig
 from toolpost.errors import LinkError
 from toolpost.links.base import Link, LinkListener, Opener
 from toolpost.links.net import socket_link
+from toolpost.sim.faults import Fault
 from toolpost.sim.ports import SimulatedSpark
-from toolpost.sim.spark import SparkOptions
 
 
-def simulated_spark_opener(options: SparkOptions) -> Opener:
+def simulated_spark_opener(config: SimulatedSparkConfig) -> Opener:
     """Return an opener of a simulated Spark core, which lives on when the link is lost."""
     core: SimulatedSpark | None = None
 
     async def open_simulated(listener: LinkListener) -> Link:
         nonlocal core
         if core is None:
-            core = SimulatedSpark(asyncio.get_running_loop(), options)
+            core = SimulatedSpark(
+                asyncio.get_running_loop(), config, baud=config.baud, faults=map(Fault.parse, config.faults)
+            )
         try:
             sock = core.connect()
         except OSError as error:

@@ -15,12 +15,19 @@ class DelayLine:
     Args:
         loop: the loop that runs the timer.
         send: takes an answer whose time has come.
+        clock: the time, seconds.
 
     Attributes:
         dropped: answers lost because too many waited.
     """
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, send: Callable[[bytes], None]) -> None:
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        send: Callable[[bytes], None],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._clock = clock
         self._loop = loop
         self._send = send
         self._waiting: deque[tuple[float, bytes]] = deque()
@@ -32,7 +39,7 @@ class DelayLine:
         if delay <= 0 and not self._waiting:
             self._send(data)
             return
-        due = time.monotonic() + delay
+        due = self._clock() + delay
         if self._waiting:
             due = max(due, self._waiting[-1][0])
         self._waiting.append((due, data))
@@ -50,12 +57,12 @@ class DelayLine:
             self._timer = None
 
     def _arm(self) -> None:
-        delay = max(0.001, self._waiting[0][0] - time.monotonic())
+        delay = max(0.001, self._waiting[0][0] - self._clock())
         self._timer = self._loop.call_later(delay, self._wake)
 
     def _wake(self) -> None:
         self._timer = None
-        now = time.monotonic()
+        now = self._clock()
         while self._waiting and self._waiting[0][0] <= now:
             self._send(self._waiting.popleft()[1])
         if self._waiting:

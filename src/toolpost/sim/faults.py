@@ -124,9 +124,16 @@ class FaultSchedule:
     Args:
         loop: the loop that runs the timers.
         apply: takes a fault that has become due.
+        clock: the time, seconds.
     """
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, apply: Callable[[Fault], None]) -> None:
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        apply: Callable[[Fault], None],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._clock = clock
         self._loop = loop
         self._apply = apply
         self._started_at: float | None = None
@@ -142,7 +149,7 @@ class FaultSchedule:
     def start(self) -> None:
         """Start the clock of ``@Ns``; the first call counts."""
         if self._started_at is None:
-            self._started_at = time.monotonic()
+            self._started_at = self._clock()
             waiting, self._unstarted = self._unstarted, []
             for fault in waiting:
                 self.add(fault, 0)
@@ -171,7 +178,7 @@ class FaultSchedule:
             self._timers.discard(timer)
             self._apply(fault)
 
-        delay = max(0.0, self._started_at + after - time.monotonic())
+        delay = max(0.0, self._started_at + after - self._clock())
         timer = self._loop.call_later(delay, due)
         self._timers.add(timer)
 

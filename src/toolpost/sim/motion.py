@@ -24,10 +24,12 @@ RAPID_FEED = 1200.0
 DEFAULT_FEED = 60.0
 """Speed of G1 until a command gives one with F, mm/min."""
 
+_PLAIN = rb"[-+]?+[0-9]{1,6}+(?:\.[0-9]{0,6}+)?+"
 RUN = re.compile(
-    rb"(?:G[01](?: [A-Z][-+]?+[0-9]{1,6}+(?:\.[0-9]{0,6}+)?+){1,7}+\n)++",
+    rb"(?:(?:G[01](?: [A-Z]%b){1,7}+|M[0-9]{1,3}+(?: [ABDEG-W]%b){0,6}+)\n)++" % (_PLAIN, _PLAIN)
 )
-"""Consecutive plain G0 and G1 lines. None can be longer than the firmware's line buffer."""
+"""Consecutive plain G0, G1 and M lines, each well within the firmware's line buffer. An M line in
+a run has no axis words, so that the last X of the run is where the x axis ends."""
 
 Position = tuple[float, float, float, float]
 
@@ -73,9 +75,7 @@ class Motion:
 
     def local(self, position: Position) -> Position:
         """Return a machine position in the selected coordinate system."""
-        x, y, z, c = (
-            value - self._origin(axis) for axis, value in zip(AXES, position, strict=True)
-        )
+        x, y, z, c = (value - self._origin(axis) for axis, value in zip(AXES, position, strict=True))
         return x, y, z, c
 
     def begin(self, line: bytes, now: float) -> float:
@@ -96,8 +96,8 @@ class Motion:
         if head in SYSTEMS:
             self.system = SYSTEMS[head]
         elif head == b"G28":
-            named = _words(line).keys()
-            self._move({letter: 0.0 for letter in _LETTERS if not named or letter in named}, 0)
+            named = [letter for letter in _LETTERS if letter in line]
+            self._move(dict.fromkeys(named or _LETTERS, 0.0), 0)
         elif head in (b"G0", b"G1") or head.startswith(b"G38."):
             words = _words(line)
             self.feed = words.get(b"F", 0.0) or self.feed

@@ -134,9 +134,7 @@ class PtyPort:
         """Serve the host that has the pty open, or look again soon."""
         self._timer = None
         if self._has_host():
-            self._stream = Stream(
-                self._loop, self._master, self.core.receive, self._host_left, self._baud
-            )
+            self._stream = Stream(self._loop, self._master, self.core.receive, self._host_left, self._baud)
         else:
             self._timer = self._loop.call_later(HOST_POLL, self._listen)
 
@@ -216,9 +214,7 @@ class SimulatedSpark:
         ours.setblocking(False)
         host.setblocking(False)
         self._socket = ours
-        self._stream = Stream(
-            self._loop, ours.fileno(), self.core.receive, self._disconnect, self._baud
-        )
+        self._stream = Stream(self._loop, ours.fileno(), self.core.receive, self._disconnect, self._baud)
         if not self.core.boots:
             self.core.boot()
             for fault in self._faults:

@@ -25,8 +25,7 @@ FAULT = b'sys < ev:"fault" >\r\n'
 BOOT: dict[str, bytes] = {
     "sys": b'sys < ev:"boot" >\r\n',
     "init": (
-        b"init < ok:true motor.ok:true\r\n"
-        b'init pulser.ok:true pulser.msg:"simulated" toolsupply.ok:true >\r\n'
+        b'init < ok:true motor.ok:true\r\ninit pulser.ok:true pulser.msg:"simulated" toolsupply.ok:true >\r\n'
     ),
     "none": b"",
 }

@@ -1,7 +1,7 @@
 """The simulated Spark core: what the firmware does with the lines of its serial port.
 
-Every time here is ``time.monotonic()``, seconds. Rules: the project's Spark serial protocol page
-(lines down, flow control, cancel, boot and fault).
+Every time here is in seconds on the core's clock, which is ``time.monotonic``. The rules are those
+of the Spark serial protocol (lines down, flow control, cancel, boot and fault).
 """
 
 import asyncio
@@ -30,10 +30,10 @@ DEFAULT_SLOW = 0.5
 DEFAULT_UNPLUGGED = 1.0
 DEFAULT_NOISE = 64
 
-_COMMAND = re.compile(rb"[GM][0-9]{1,4}(?:\.[0-9])?(?: *[A-Z][-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+))* *")
-_SET = re.compile(
-    rb"f?set +([A-Za-z0-9_]+(?:\.[A-Za-z0-9_]+)*) +([-+]?[0-9]{1,9}(?:\.[0-9]{0,9})?) *"
-)
+_NUMBER = rb"[-+]?(?:[0-9]++(?:\.[0-9]*+)?+|\.[0-9]++)"  # possessive, or a bad line would take for ever
+_COMMAND = re.compile(rb"[GM][0-9]{1,4}+(?:\.[0-9])?+(?: *[A-Z]%b)*+ *+" % _NUMBER)
+_HOME = re.compile(rb"G28(?: *[XYZC])* *")
+_SET = re.compile(rb"f?set +([A-Za-z0-9_]+(?:\.[A-Za-z0-9_]+)*) +([-+]?[0-9]{1,9}(?:\.[0-9]{0,9})?) *")
 _DWELL = re.compile(rb"G0?4 ?P([0-9]+\.?[0-9]*|\.[0-9]+)")
 _LINEAR = re.compile(rb"G0?([01])(?![0-9.])")
 _SHORTEST_WAIT = 0.001  # below it a loop's timers round to a busy loop
@@ -92,6 +92,7 @@ class SparkCore:
         options: what the core is like.
         trace: takes ("received" | "executed" | "ignored" | "lost", line) for every line; None
             costs nothing.
+        clock: the time, seconds; a test may bring its own, together with its loop.
 
     Attributes:
         received: commands that arrived; signals are none.
@@ -115,7 +116,9 @@ class SparkCore:
         loop: asyncio.AbstractEventLoop,
         options: SparkOptions,
         trace: Callable[[str, bytes], None] | None = None,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        self._clock = clock
         self._send = send
         self._loop = loop
         self._options = options
@@ -139,8 +142,8 @@ class SparkCore:
         self._lines = LineReader()
         self._edits = 0
         self._motion = Motion(self.settings)
-        self._faults = FaultSchedule(loop, self._apply)
-        self._answers = DelayLine(loop, self._up)
+        self._faults = FaultSchedule(loop, self._apply, clock)
+        self._answers = DelayLine(loop, self._up, clock)
         self._delay = options.answer_delay
         self._waiting: deque[bytes] = deque()
         self._running: bytes | None = None
@@ -150,7 +153,7 @@ class SparkCore:
         self._edm_rest = b""
         self._edm_asked = 0
         self._cut_at = -math.inf
-        self._booted_at = time.monotonic()
+        self._booted_at = self._clock()
         self._booting = False
         self._failed = False
         self._stalled_at: float | None = None
@@ -168,7 +171,7 @@ class SparkCore:
     @property
     def position(self) -> dict[str, float]:
         """The machine position now: mm, and degrees for c."""
-        return dict(zip(AXES, self._motion.position(time.monotonic()), strict=True))
+        return dict(zip(AXES, self._motion.position(self._clock()), strict=True))
 
     @property
     def queue_length(self) -> int:
@@ -219,7 +222,7 @@ class SparkCore:
 
     def _end_boot(self, message: bytes) -> None:
         self._booting = False
-        self._booted_at = time.monotonic()
+        self._booted_at = self._clock()
         self._lines.reset()
         self._choose_path()
         if message:
@@ -247,7 +250,7 @@ class SparkCore:
         """Take bytes from the host, in any chunks."""
         if self._closed:
             return
-        now = time.monotonic()
+        now = self._clock()
         if self._running is not None:
             self._advance(now)
         if self._deaf_until and now >= self._deaf_until:
@@ -306,7 +309,7 @@ class SparkCore:
         for line in lines.split(LF)[:-1]:
             self._note("received", line)
             if _is_command(line):
-                self._count_arrival(time.monotonic())
+                self._count_arrival(self._clock())
                 self.ignored += 1
             self._note("ignored", line)
 
@@ -462,7 +465,7 @@ class SparkCore:
 
     def _wake(self) -> None:
         self._wake_timer = None
-        self._advance(time.monotonic())
+        self._advance(self._clock())
 
     def _finish(self, line: bytes) -> None:
         self.executed += 1
@@ -475,7 +478,7 @@ class SparkCore:
         elif line[:3] == b"get":
             self._up(replies.settings_report(self.settings))
         elif line[:4] == b"stat":
-            seconds = time.monotonic() - self._booted_at
+            seconds = self._clock() - self._booted_at
             self._up(replies.statistics(self.executed, seconds))
         self._start_next()
         if self._faults.counting:
@@ -532,15 +535,11 @@ class SparkCore:
                 self.unplug(DEFAULT_UNPLUGGED if amount is None else amount)
             case "garbage":
                 self._garbled += 1
-                self._up(
-                    replies.noise(int(DEFAULT_NOISE if amount is None else amount), self._garbled)
-                )
+                self._up(replies.noise(int(DEFAULT_NOISE if amount is None else amount), self._garbled))
             case "queue-full":
                 self._refuse_next += 1
             case "slow":
-                self._delay = self._options.answer_delay + (
-                    DEFAULT_SLOW if amount is None else amount
-                )
+                self._delay = self._options.answer_delay + (DEFAULT_SLOW if amount is None else amount)
             case "drop-answer":
                 self._drop_answers += 1
             case "error":
@@ -553,7 +552,7 @@ class SparkCore:
         self._muted = False
 
     def _stall(self, seconds: float | None) -> None:
-        now = time.monotonic()
+        now = self._clock()
         if self._stalled_at is None:
             self._stalled_at = now
             self._motion.pause(now)
@@ -565,7 +564,7 @@ class SparkCore:
     def _end_stall(self) -> None:
         if self._stalled_at is None:
             return
-        now = time.monotonic()
+        now = self._clock()
         if self._running is None:
             self._due = now
             self._stalled_at = None
@@ -579,7 +578,7 @@ class SparkCore:
 
     def _fail(self) -> None:
         """Enter fault mode (Spark serial protocol, fault): motion ends, only reports still work."""
-        self._motion.halt(time.monotonic())
+        self._motion.halt(self._clock())
         self._drop_commands()
         self._failed = True
         self._up(replies.FAULT)
@@ -614,7 +613,8 @@ def _is_command(line: bytes) -> bool:
 def _problem(line: bytes) -> str | None:
     """Return what is wrong with a command, None when nothing is."""
     if line[:1] in (b"G", b"M"):
-        return None if _COMMAND.fullmatch(line) else "invalid command"
+        known = _COMMAND.fullmatch(line) or _HOME.fullmatch(line)
+        return None if known else "invalid command"
     word = line.split(None, 1)[0]
     if word == b"set":
         return None if _SET.fullmatch(line) else "invalid set"

@@ -1,6 +1,7 @@
 """API keys: only their hashes are kept.
 
-A key is 256 random bits, so a plain SHA-256 of it cannot be guessed back; hashes are compared in constant time.
+A key is 256 random bits, so a plain SHA-256 of it cannot be guessed back; hashes are compared in constant
+time.
 """
 
 import hashlib

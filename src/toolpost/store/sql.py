@@ -16,7 +16,5 @@ def load_queries() -> dict[str, str]:
 def load_migrations() -> list[str]:
     """Return the migrations in order; the schema's version is the number of those applied."""
     folder = resources.files(__package__).joinpath("migrations")
-    files = sorted(
-        (entry for entry in folder.iterdir() if entry.name.endswith(".sql")), key=lambda e: e.name
-    )
+    files = sorted((entry for entry in folder.iterdir() if entry.name.endswith(".sql")), key=lambda e: e.name)
     return [file.read_text("utf-8") for file in files]

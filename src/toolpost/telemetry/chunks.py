@@ -8,15 +8,15 @@ from pathlib import Path
 
 import msgspec
 
-from toolpost.telemetry.columns import Head, PackedRows
+from toolpost.telemetry.columns import Column, Head, PackedRows
+from toolpost.telemetry.recent import Recent
 from toolpost.telemetry.shape import Shape, ShapeDef
 
 PAGE_BYTES = 16_384
 _CACHE_KIB = 2_048
-_CACHED_ROWS = 1 << 20
-"""Rows whose times are kept in RAM after a query, 4 bytes each."""
-_WAL_PAGES = 64
-"""Pages of WAL that start a checkpoint: 1 MiB, so that the WAL stays small on small disks."""
+_KEPT_TIMES = 1 << 20
+_KEPT_VALUES = 1 << 20
+"""Times (4 bytes each) and values (mostly 1 or 2) that stay in RAM after a query."""
 
 SQL = dict(
     re.findall(
@@ -33,12 +33,13 @@ class ChunkFile:
     Args:
         path: the file; it is made if missing.
         max_pages: pages of `PAGE_BYTES` that the file may have.
+        wal_pages: pages of the WAL that start a checkpoint.
     """
 
-    def __init__(self, path: Path, max_pages: int) -> None:
+    def __init__(self, path: Path, max_pages: int, wal_pages: int) -> None:
         self._max_pages = max_pages
-        self._heads: dict[int, Head] = {}  # the least recently used one first
-        self._heads_rows = 0
+        self._heads = Recent[int, Head](_KEPT_TIMES)
+        self._columns = Recent[tuple[int, int], Column](_KEPT_VALUES)
         self._db = sqlite3.connect(path, isolation_level=None)
         try:
             for pragma in (
@@ -47,8 +48,8 @@ class ChunkFile:
                 "journal_mode = WAL",
                 "synchronous = NORMAL",
                 f"cache_size = -{_CACHE_KIB}",
-                f"wal_autocheckpoint = {_WAL_PAGES}",
-                f"journal_size_limit = {2 * _WAL_PAGES * PAGE_BYTES}",
+                f"wal_autocheckpoint = {wal_pages}",
+                f"journal_size_limit = {wal_pages * PAGE_BYTES}",
                 f"max_page_count = {max_pages}",
             ):
                 self._db.execute(f"PRAGMA {pragma}").close()
@@ -151,16 +152,9 @@ class ChunkFile:
         """Open the packed rows of a chunk for reading; the caller closes them."""
         return self._db.blobopen("body", "data", chunk, readonly=True)
 
-    def read_rows(self, chunk: int, blob: sqlite3.Blob, columns: int) -> PackedRows:
-        """Return the rows of a chunk of so many columns, opened with `open_blob`."""
-        head = self._heads.pop(chunk, None)
-        if head is None:
-            head = Head(blob, columns)
-            self._heads_rows += head.rows
-            while self._heads and self._heads_rows > _CACHED_ROWS:
-                self._heads_rows -= self._heads.pop(next(iter(self._heads))).rows
-        self._heads[chunk] = head
-        return PackedRows(blob, head)
+    def open_rows(self, chunk: int, columns: int) -> "ChunkRows":
+        """Open a chunk of so many columns for reading."""
+        return ChunkRows(self, chunk, columns, self._heads, self._columns)
 
     def checkpoint(self) -> None:
         """Make every chunk survive a loss of power."""
@@ -169,3 +163,49 @@ class ChunkFile:
     def close(self) -> None:
         """Close the file."""
         self._db.close()
+
+
+class ChunkRows:
+    """The rows of a chunk. Close it; the database is read only for what is not in RAM."""
+
+    __slots__ = ("_blob", "_chunk", "_columns", "_file", "_head", "first_us", "offsets", "rows")
+
+    def __init__(
+        self,
+        file: ChunkFile,
+        chunk: int,
+        columns: int,
+        heads: Recent[int, Head],
+        kept: Recent[tuple[int, int], Column],
+    ) -> None:
+        self._file = file
+        self._chunk = chunk
+        self._columns = kept
+        self._blob: sqlite3.Blob | None = None
+        head = heads.get(chunk)
+        if head is None:
+            head = Head(self._opened(), columns)
+            heads.put(chunk, head, head.rows)
+        self._head = head
+        self.rows = head.rows
+        self.first_us = head.first_us
+        self.offsets = head.offsets
+
+    def _opened(self) -> sqlite3.Blob:
+        if self._blob is None:
+            self._blob = self._file.open_blob(self._chunk)
+        return self._blob
+
+    def column(self, place: int) -> Column:
+        """Return the column at ``place``."""
+        key = (self._chunk, place)
+        column = self._columns.get(key)
+        if column is None:
+            column = PackedRows(self._opened(), self._head).column(place)
+            self._columns.put(key, column, self.rows)
+        return column
+
+    def close(self) -> None:
+        """Close what was opened."""
+        if self._blob is not None:
+            self._blob.close()

@@ -3,11 +3,11 @@
 import msgspec
 
 
-class Limits(msgspec.Struct, frozen=True):
+class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The bounds of one telemetry store.
 
     Attributes:
-        max_bytes: bytes on disk of database, WAL and journal together; at least 2 MiB are used.
+        max_bytes: bytes on disk of database, WAL and journal together; at least 4 MiB are used.
         max_age_s: seconds after which a chunk of rows is deleted.
         tags_per_machine: reports with a tag beyond these are dropped.
         shapes_per_tag: reports with a new set of keys or kinds beyond these are dropped.

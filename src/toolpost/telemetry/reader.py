@@ -5,14 +5,15 @@ from array import array
 from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import closing
 from itertools import islice, repeat
 from operator import sub
 from typing import NamedTuple, Protocol
 
+from toolpost.core.grid import SampleGrid
 from toolpost.core.report import Report, Value
 from toolpost.telemetry.chunks import ChunkFile
 from toolpost.telemetry.columns import Column, live_column, picker
-from toolpost.telemetry.grid import SampleGrid
 from toolpost.telemetry.shape import Run, Shape
 
 
@@ -139,8 +140,7 @@ class _Sampler:
                     self._take(_TailRows(shape), start, stop, places, values, stamps)
                     continue
                 chunk = track.run.ids[piece]
-                with self._chunks.open_blob(chunk) as blob:
-                    rows = self._chunks.read_rows(chunk, blob, width)
+                with closing(self._chunks.open_rows(chunk, width)) as rows:
                     self._take(rows, start, stop, places, values, stamps)
         return values
 
@@ -175,7 +175,7 @@ class _Sampler:
         first, window = rows.first_us, self._window
         offsets = rows.offsets
         sought = [time - first for time in self._times[start:stop]]
-        found = [bisect_right(offsets, offset) - 1 for offset in sought]
+        found = [after - 1 for after in map(bisect_right, repeat(offsets), sought)]
         samples: Sequence[int] = range(start, stop)
         hits = picker(found)(offsets)
         if max(map(sub, sought, hits)) > window:
@@ -229,8 +229,7 @@ def _backwards(track: Track, count: int, chunks: ChunkFile) -> Iterator[Report]:
             reports = _reports(_TailRows(shape), shape, count)
         else:
             chunk = track.run.ids[piece]
-            with chunks.open_blob(chunk) as blob:
-                rows = chunks.read_rows(chunk, blob, len(shape.columns))
+            with closing(chunks.open_rows(chunk, len(shape.columns))) as rows:
                 reports = _reports(rows, shape, count)
         yield from reversed(reports)
         count -= len(reports)

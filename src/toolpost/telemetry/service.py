@@ -9,8 +9,8 @@ from itertools import islice
 from pathlib import Path
 from typing import TypeVar
 
+from toolpost.core.grid import SampleGrid
 from toolpost.core.report import Report, Value
-from toolpost.telemetry.grid import SampleGrid
 from toolpost.telemetry.limits import Limits
 from toolpost.telemetry.store import Store
 

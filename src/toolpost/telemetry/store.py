@@ -7,12 +7,12 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from toolpost.core.grid import SampleGrid
 from toolpost.core.report import Report, Value
 from toolpost.errors import StorageError
 from toolpost.telemetry import reader
 from toolpost.telemetry.chunks import PAGE_BYTES, ChunkFile
 from toolpost.telemetry.columns import pack
-from toolpost.telemetry.grid import SampleGrid
 from toolpost.telemetry.intake import Intake, is_time
 from toolpost.telemetry.journal import Block, Journal
 from toolpost.telemetry.limits import Limits
@@ -30,8 +30,9 @@ RETRY_S = 5.0
 RETIRE_S = 600.0
 """Seconds between passes that delete what is too old."""
 
-_MIN_BYTES = 2 << 20
+_MIN_BYTES = 4 << 20
 _MAX_RESERVE = 32 << 20
+_MAX_WAL_PAGES = 64
 _log = logging.getLogger(__name__)
 
 _Rows = tuple[list[int], list[tuple[Value, ...]]]
@@ -80,12 +81,13 @@ class Store:
         self._announced: set[int] = set()
         self._journal_trouble = _Episode("journal")
         self._chunk_trouble = _Episode("database")
-        self._retry_at = self._synced_at = 0.0
+        self._retry_at = self._compact_at = self._synced_at = 0.0
         self._retired_at = (time.monotonic(), time.time())
         try:
             directory.mkdir(parents=True, exist_ok=True)
             pages = (allowed - self._reserve) // PAGE_BYTES
-            self._chunks = _open_chunks(directory / "telemetry.db", pages)
+            wal_pages = min(_MAX_WAL_PAGES, self._reserve // 4 // PAGE_BYTES)
+            self._chunks = _open_chunks(directory / "telemetry.db", pages, wal_pages)
         except (OSError, sqlite3.Error) as error:
             raise StorageError(f"telemetry in {directory}: {error}") from error
         try:
@@ -138,8 +140,8 @@ class Store:
         if now - self._synced_at >= SYNC_S:
             self._synced_at = now
             self._sync()
-        if self._journal.size >= self._rewrite_at:
-            self._compact()
+        if self._journal.size >= self._rewrite_at and now >= self._compact_at:
+            self._compact_at = 0.0 if self._compact() else now + RETRY_S
         if now - self._retired_at[0] >= RETIRE_S:
             self._retire(now, time.time())
 
@@ -170,7 +172,7 @@ class Store:
                 continue
             rows = fresh.get(shape)
             if rows is None:
-                shape.epoch = state.epoch
+                self._end_epoch(shape, state.epoch)
                 rows = fresh[shape] = ([], [])
             rows[0].append(time_us)
             rows[1].append(tuple(report.values.values()))
@@ -181,8 +183,10 @@ class Store:
         blocks: list[Block] = []
         accepted: list[tuple[Shape, list[int], list[Sequence[object]]]] = []
         for shape, (times, rows) in fresh.items():
+            if len(shape.times) >= 2 * CHUNK_ROWS:
+                self._seal(shape)
             if len(shape.times) >= 2 * CHUNK_ROWS or self._journal.size > self._reserve // 2:
-                self.dropped += len(times)  # the disk is full: nothing can be sealed
+                self.dropped += len(times)  # the disk is full: nothing leaves RAM or the journal
                 continue
             columns = shape.clean(rows, self._limits.text_chars)
             definition = None if shape.number in self._announced else shape.definition
@@ -257,8 +261,12 @@ class Store:
         except OSError as error:
             self._journal_trouble.fail(error)
 
-    def _compact(self) -> None:
-        """Rewrite the journal with nothing but the tails, after sealing those that are large."""
+    def _compact(self) -> bool:
+        """Rewrite the journal with nothing but the tails, after sealing those that are large.
+
+        Returns:
+            Whether that worked.
+        """
         tails = sorted(
             (shape for shape in self._shapes.values() if shape.times), key=lambda tail: tail.weight
         )
@@ -267,7 +275,7 @@ class Store:
             largest = tails.pop()
             weight -= largest.weight
             if not self._seal(largest):
-                return
+                return False
         blocks = [
             Block.of(tail, tail.definition, tail.sealed, tail.times, tail.listed_columns()) for tail in tails
         ]
@@ -277,10 +285,10 @@ class Store:
             self._journal.rewrite(blocks)
         except (OSError, sqlite3.Error) as error:
             self._journal_trouble.fail(error)
-            self._rewrite_at += self._reserve // 8
-            return
+            return False
         self._announced = {tail.number for tail in tails}
         self._rewrite_at = max(self._reserve // 8, 2 * self._journal.size)
+        return True
 
     def _retire(self, now: float, unix: float) -> None:
         """Delete what is too old, unless the clock was set since the last pass."""
@@ -318,10 +326,10 @@ class Store:
             self._chunks.close()
 
 
-def _open_chunks(path: Path, pages: int) -> ChunkFile:
+def _open_chunks(path: Path, pages: int, wal_pages: int) -> ChunkFile:
     """Open the database; one that is damaged is put aside, for telemetry must not stop a start."""
     try:
-        return ChunkFile(path, pages)
+        return ChunkFile(path, pages, wal_pages)
     except sqlite3.OperationalError:
         raise
     except sqlite3.DatabaseError as error:
@@ -330,4 +338,4 @@ def _open_chunks(path: Path, pages: int) -> ChunkFile:
         for suffix in ("-wal", "-shm"):
             path.with_name(path.name + suffix).unlink(missing_ok=True)
         _log.warning("telemetry: %s is damaged (%s), it is now %s", path, error, aside)
-        return ChunkFile(path, pages)
+        return ChunkFile(path, pages, wal_pages)

@@ -3,12 +3,12 @@
 import math
 
 from toolpost.clock import now_us, seconds
+from toolpost.core.grid import SampleGrid
 from toolpost.core.job import Job, JobState
 from toolpost.dialects.spooler import words
 from toolpost.dialects.spooler.commands import decode_blocks
 from toolpost.errors import InvalidLineError, InvalidRequestError, NotAcceptedError
 from toolpost.shop import Shop
-from toolpost.telemetry.grid import SampleGrid
 
 MAX_COUNT = 10_000
 MAX_KEYS = 1_000
@@ -68,9 +68,7 @@ class SpoolerApi:
         if count > MAX_COUNT:
             raise InvalidRequestError(f"count: too big, must be <= {MAX_COUNT}")
         reports = await self._shop.reports(self._machine, request.tag, count)
-        return words.GetPsAnswer(
-            [words.PState(seconds(report.time_us), report.values) for report in reports]
-        )
+        return words.GetPsAnswer([words.PState(seconds(report.time_us), report.values) for report in reports])
 
     async def status(self, request: words.Empty, actor: str) -> words.StatusAnswer:  # noqa: ARG002
         """``/status``: the machine in brief."""
@@ -112,7 +110,7 @@ class SpoolerApi:
         commands = memoryview(request.commands)
         if commands[:5].tobytes() == b"null":
             raise InvalidRequestError("commands: must be given")
-        signals = self._check_signals({**(request.signals or {}), **(request.polls or {})})
+        signals = self._check_signals(request.signals or {}, request.polls or {})
         try:
             job = await self._shop.submit(self._machine, decode_blocks(commands), signals, actor=actor)
         except NotAcceptedError:
@@ -141,20 +139,25 @@ class SpoolerApi:
         values = await self._shop.query(self._machine, keys, grid)
         return words.QueryTsAnswer(grid.seconds(), values)
 
-    def _check_signals(self, signals: dict[str, float]) -> dict[str, float]:
-        if len(signals) > MAX_SIGNALS:
-            raise InvalidRequestError(f"signals: must be at most {MAX_SIGNALS}")
+    def _check_signals(self, signals: dict[str, float], polls: dict[str, float]) -> dict[str, float]:
+        """Return both together; newer clients may poll with any line, older ones with ``?`` signals only."""
+        if len(signals) + len(polls) > MAX_SIGNALS:
+            raise InvalidRequestError(f"signals: must be at most {MAX_SIGNALS}, polls included")
         checked = {}
-        for line, interval in signals.items():
-            if not (math.isfinite(interval) and MIN_INTERVAL <= interval <= MAX_INTERVAL):
-                raise InvalidRequestError(
-                    f"signals: the interval of {line[:100]!r} must be from {MIN_INTERVAL} to "
-                    f"{MAX_INTERVAL:g} seconds"
-                )
-            try:
-                checked[self._shop.check_poll(self._machine, line)] = interval
-            except InvalidRequestError as error:
-                raise InvalidRequestError(f"signals: {line[:100]!r} {error}") from None
+        for name, lines in (("signals", signals), ("polls", polls)):
+            for line, interval in lines.items():
+                where = f"{name}: {line[:100]!r}"
+                if not (math.isfinite(interval) and MIN_INTERVAL <= interval <= MAX_INTERVAL):
+                    raise InvalidRequestError(
+                        f"{where}: the interval must be from {MIN_INTERVAL} to {MAX_INTERVAL:g} seconds"
+                    )
+                try:
+                    text = self._shop.check_poll(self._machine, line)
+                except InvalidRequestError as error:
+                    raise InvalidRequestError(f"{where}: {error}") from None
+                if lines is signals and not text.startswith("?"):
+                    raise InvalidRequestError(f"{where}: must begin with ?")
+                checked[text] = interval
         return checked
 
     def _job(self, job: Job) -> words.JobAnswer:
@@ -171,4 +174,3 @@ class SpoolerApi:
             num_sent=progress.sent,
             num_executed=progress.executed,
         )
-

@@ -32,6 +32,7 @@ _QUEUE_FULL = "queue full"
 _IDLE_ANSWERS = 2
 _MAX_WAITING = 10_000
 _MAX_UNWRITTEN = 65_536
+_PATIENCE_MOST = 10.0
 _BACK_OFF_FIRST, _BACK_OFF_MOST = 0.1, 5.0
 
 
@@ -79,6 +80,7 @@ class SparkDriver:
         self._fault = False
         self._stop_owed = options.stop_on_connect
         self._unanswered_at: float | None = None
+        self._patience = options.answer_timeout
         self._executed_at = (0.0, 0)
         self._ticker: asyncio.TimerHandle | None = None
         self._ask_timer: asyncio.TimerHandle | None = None
@@ -320,6 +322,8 @@ class SparkDriver:
         if not flow.answer(capacity, num):
             self._ask_if_none()
             return
+        # A core that always answers late must not be given up again and again.
+        self._patience = max(self._options.answer_timeout, 2 * (now - self._asked_at))
         if flow.idle:
             self._idle()
         else:
@@ -479,27 +483,28 @@ class SparkDriver:
         now = self._loop.time()
         if self._flow.asking and now - self._asked_at > self._options.answer_timeout:
             self._silent(now)
+        if self._flow.asking and now - self._asked_at > self._patience:
+            self._patience = min(2 * self._patience, _PATIENCE_MOST)
+            self._flow.lose()
+            self._asked_at = now
         if now - self._asked_at >= HEARTBEAT * 0.9 and not self._flow.asking:
             self._ask()
 
     def _silent(self, now: float) -> None:
         """The last question was not answered in time."""
-        self._flow.lose()
-        self._asked_at = now
-        self._unanswered_at = self._unanswered_at or now - self._options.answer_timeout
+        self._unanswered_at = self._unanswered_at or self._asked_at
         if self._alive:
             self._alive = False
             log.warning("%s: the core does not answer", self._name)
             self._comm.note("no answer to ?queue")
-        self._listener.changed()
+            self._listener.changed()
         if self._source is not None and now - self._unanswered_at > self._options.silence_limit:
             detail = f"no answer for {self._options.silence_limit:g} s"
             self._drop_work(Ending(Outcome.FAILED, Reason.MACHINE_SILENT, detail))
             self._send_stop()
+            self._listener.changed()
 
     def _cancel_timers(self) -> None:
         for timer in (self._ticker, self._ask_timer):
             if timer is not None:
                 timer.cancel()
-
-

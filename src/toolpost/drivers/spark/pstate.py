@@ -1,7 +1,7 @@
 """P-states: the only lines that a Spark core sends (Spark serial protocol, lines up).
 
-``tag [<] {key:value} [>]``: ``<`` opens a p-state, ``>`` delivers it, and a line with neither goes on with one
-that is open. Lines of different tags may interleave. An error in a line drops the whole open p-state of its
+``tag [<] {key:value} [>]``: ``<`` opens a p-state, ``>`` delivers it, and a line with neither goes on with
+one that is open. Lines of different tags may interleave. An error in a line drops the whole open p-state of its
 tag, so that half a p-state is never taken for a whole one.
 """
 

@@ -63,7 +63,7 @@ def test_limit_is_the_callers():
 
 
 def test_does_not_drift():
-    grid = SampleGrid.from_seconds(0, 10_000 / 3, 1 / 3)
+    grid = SampleGrid.from_seconds(0, 3_000, 1 / 3)
     exact = [round(Fraction(k, 3) * 10**6) for k in range(grid.count)]
     assert grid.times_us() == exact
     assert grid.window_us == 333_333
@@ -76,12 +76,11 @@ def test_does_not_drift():
 )
 def test_samples_end_at_the_end(start, length, step):
     end = start + length
-    try:
-        grid = SampleGrid.from_seconds(start, end, step)
-    except ValueError as error:
-        assert str(error) == "too many steps"
-        assert (end - start) / step > 10_000
+    if (end - start) / step > 10_000:
+        with pytest.raises(ValueError, match="too many steps"):
+            SampleGrid.from_seconds(start, end, step)
         return
+    grid = SampleGrid.from_seconds(start, end, step)
     assert 1 <= grid.count <= 10_001
     times = grid.seconds()
     assert times == sorted(times)
