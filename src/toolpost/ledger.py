@@ -109,17 +109,11 @@ class Ledger:
         self._put(job)
         self._unsaved.add(seq)
         self._pay_debts()
-        try:
-            await asyncio.shield(self._store.add(job, actor))
-        except StorageError:
-            del self._jobs[seq]
-            self._open.pop(seq, None)
-            raise
-        finally:
-            self._unsaved.discard(seq)
-        job = self._jobs[seq]
-        self._changed(job)
-        return job
+        future = self._store.add(job, actor)
+        # Not after the await: whoever waits may be canceled, and the job is on disk or is not all the same.
+        future.add_done_callback(partial(self._added, job))
+        await asyncio.shield(future)
+        return self._jobs.get(seq, job)
 
     async def change(self, job: Job, actor: str = SYSTEM) -> None:
         """Make a transition that a machine may rest on; it is on disk when this returns.
@@ -152,6 +146,14 @@ class Ledger:
         at_us = now_us()
         return [self.declare(job.to(state, reason, at_us), actor) for job in self.open]
 
+    def _added(self, job: Job, future: "asyncio.Future[None]") -> None:
+        self._unsaved.discard(job.seq)
+        if future.cancelled() or future.exception() is not None:
+            self._jobs.pop(job.seq, None)
+            self._open.pop(job.seq, None)
+        else:
+            self._changed(self._jobs.get(job.seq, job))
+
     def _submit(self, job: Job, actor: str) -> "asyncio.Future[None]":
         future = self._store.update(job, now_us(), actor)
         future.add_done_callback(partial(self._submitted, job, actor))
@@ -164,6 +166,8 @@ class Ledger:
         if error is None:
             self._changed(job)
             return
+        if self._jobs.get(job.seq, job) is not job:
+            return  # A later transition has been handed to the disk, which must not be overwritten.
         log.error("%s: job %s: %s; trying again", self._machine, job.id, error)
         self._debts[job.seq] = (job, actor)
         if self._retry is None:

@@ -15,6 +15,8 @@ from toolpost.machine import Machine
 from toolpost.store import Store
 from toolpost.telemetry import Telemetry
 
+_READERS = 4
+
 
 class Status(msgspec.Struct, frozen=True, kw_only=True):
     """A machine in brief.
@@ -63,6 +65,8 @@ class Shop:
         self._programs = store.programs
         self._telemetry = telemetry
         self._programs_bytes = programs_bytes
+        # Each may make a large answer: so many at a time, whatever is asked.
+        self._readers = asyncio.Semaphore(_READERS)
         self._adding: dict[str, int] = dict.fromkeys(machines, 0)
         self._cancels: dict[str, int] = dict.fromkeys(machines, 0)
 
@@ -225,11 +229,13 @@ class Shop:
 
     async def reports(self, machine: str, tag: str, count: int) -> list[Report]:
         """Return the latest reports of a tag, the latest first."""
-        return await self._telemetry.history(machine, tag, count)
+        async with self._readers:
+            return await self._telemetry.history(machine, tag, count)
 
     async def query(self, machine: str, keys: Sequence[str], grid: SampleGrid) -> dict[str, list[Value]]:
         """Return the series named ``tag.key``, sampled at the times of `grid`."""
-        return await self._telemetry.query(machine, keys, grid)
+        async with self._readers:
+            return await self._telemetry.query(machine, keys, grid)
 
     def _trim_programs(self) -> None:
         if any(self._adding.values()):

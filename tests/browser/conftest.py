@@ -4,8 +4,9 @@ import shutil
 from collections.abc import Iterator
 
 import pytest
-from harness import CHROMIUM_FLAGS
 from playwright.sync_api import Browser, sync_playwright
+
+from tests.browser.watching import CHROMIUM_FLAGS
 
 
 @pytest.fixture(scope="module")

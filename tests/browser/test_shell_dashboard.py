@@ -20,7 +20,8 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Error, Locator, Page, expect
 
-from harness import StaticSite, Toolpost, Watch, free_port, port_taken
+from tests.browser.watching import StaticSite, Watch, port_taken
+from tests.harness import Server
 
 pytestmark = pytest.mark.browser
 
@@ -33,7 +34,7 @@ PATIENCE = 15_000  # milliseconds, for whatever the page shows in the end
 
 CONFIG = """\
 [server]
-listen = "127.0.0.1:{main}"
+listen = "127.0.0.1:0"
 
 [machines.edm]
 driver = "spark"
@@ -44,6 +45,11 @@ listen = ["127.0.0.1:{port}"]
 answer_delay = {answer_delay}
 command_time = {command_time}
 """
+
+
+def sent_by(server: Server) -> list[str]:
+    """Every line that went to the machine so far."""
+    return [payload for direction, payload in server.comm_log() if direction == "down"]
 
 
 def commands(lines: list[str]) -> list[str]:
@@ -140,6 +146,7 @@ class Dashboard:
     def refresh_settings(self) -> None:
         with self.page.expect_response(answer_to("/get-ps", tag="stg"), timeout=PATIENCE):
             self.button("Settings", "REFRESH").click(timeout=PATIENCE)
+        expect(self.widget("Settings")).to_contain_text("Showing ", timeout=PATIENCE)
         self.watch.settle(200)
 
     def edit_setting(self, key: str, value: str) -> None:
@@ -209,23 +216,18 @@ def site(client_folder: Path) -> Iterator[StaticSite]:
 def server(
     client_folder: Path,  # noqa: ARG001 (without a client there is nothing to start it for)
     tmp_path_factory: pytest.TempPathFactory,
-) -> Iterator[Toolpost]:
+) -> Iterator[Server]:
     if port_taken(PORT):
         pytest.skip(f"port {PORT}, which is fixed in the client, is taken")
-    config = CONFIG.format(main=free_port(), port=PORT, answer_delay=ANSWER_DELAY, command_time=COMMAND_TIME)
-    server = Toolpost(tmp_path_factory.mktemp("toolpost"), config)
-    server.start(listeners=2)
-    try:
+    config = CONFIG.format(port=PORT, answer_delay=ANSWER_DELAY, command_time=COMMAND_TIME)
+    with Server(tmp_path_factory.mktemp("toolpost"), config, listeners=2) as server:
         yield server
         assert server.stop() == 0
-        output = "\n".join(server.output)
-        assert "Traceback" not in output, output
-    finally:
-        server.kill()
+        assert "Traceback" not in server.log, server.log
 
 
 @pytest.fixture(scope="module")
-def session(browser: Browser, site: StaticSite, server: Toolpost) -> Iterator[Dashboard]:  # noqa: ARG001
+def session(browser: Browser, site: StaticSite, server: Server) -> Iterator[Dashboard]:  # noqa: ARG001
     """One page for all tests, as an operator leaves it open all day."""
     context = browser.new_context(viewport={"width": 1280, "height": 1600})
     context.grant_permissions(["clipboard-read", "clipboard-write"], origin=site.origin)
@@ -267,13 +269,13 @@ def test_status_shows_idle_and_busy(dashboard: Dashboard) -> None:
     expect(jog).to_be_enabled()
 
 
-def test_pasted_job_runs_until_it_is_completed(dashboard: Dashboard, server: Toolpost) -> None:
+def test_pasted_job_runs_until_it_is_completed(dashboard: Dashboard, server: Server) -> None:
     steps = 60
     job = ["; made for a test", "G53", "", *(f"G1 X{i} Y{-i} ; step {i}" for i in range(steps))]
     job += ["  ", ";", "G1 X7 Y8 Z9"]
     seconds = steps * COMMAND_TIME
     before = len(dashboard.job_statuses())
-    logged = len(server.sent())
+    logged = len(sent_by(server))
     expect(dashboard.button("Add Job", "EXECUTE")).to_be_disabled()
 
     with dashboard.watch.answers("/add-job") as added:
@@ -294,7 +296,7 @@ def test_pasted_job_runs_until_it_is_completed(dashboard: Dashboard, server: Too
     assert len(dashboard.job_statuses()) == before + 1
     elapsed = dashboard.rows("Job List").first.locator("td").nth(2)
     assert int(elapsed.inner_text().removesuffix("s")) >= int(seconds)
-    lines = server.sent()[logged:]
+    lines = sent_by(server)[logged:]
     moves = [f"G1 X{i} Y{-i}" for i in range(steps)]
     assert commands(lines) == ["G53", *moves, "G1 X7 Y8 Z9"]
     assert lines.count("?edm") >= seconds / 0.5 - 1
@@ -551,10 +553,10 @@ def test_empty_lines_and_comments_in_a_manual_batch(dashboard: Dashboard) -> Non
     dashboard.expect_position("(machine) X15.000 Y12.000")
 
 
-def test_cancel_ends_a_running_job(dashboard: Dashboard, server: Toolpost) -> None:
+def test_cancel_ends_a_running_job(dashboard: Dashboard, server: Server) -> None:
     dashboard.run("G53\nG0 X0 Y0 Z0")
     before = len(dashboard.job_statuses())
-    logged = len(server.sent())
+    logged = len(sent_by(server))
     dashboard.paste_job([f"G1 X{i}" for i in range(1, 401)])
     dashboard.expect_busy(re.compile(r"Job \S+ running"))
     dashboard.page.wait_for_timeout(1_000)
@@ -572,7 +574,7 @@ def test_cancel_ends_a_running_job(dashboard: Dashboard, server: Toolpost) -> No
     dashboard.page.wait_for_timeout(2_500)  # two rounds of the page's polling
     now = dashboard.position()["X"]
     assert now == pytest.approx(stopped["kv"]["m.x"], abs=0.0011), "it moved after a cancel"
-    lines = server.sent()[logged:]
+    lines = sent_by(server)[logged:]
     assert lines.count("!") == 1
     assert commands(lines[lines.index("!") :]) == []
 
@@ -592,9 +594,9 @@ def test_cancel_of_nothing_changes_nothing(dashboard: Dashboard) -> None:
     assert dashboard.position() == position
 
 
-def test_tool_supply_attaches_in_one_burst(dashboard: Dashboard, server: Toolpost) -> None:
+def test_tool_supply_attaches_in_one_burst(dashboard: Dashboard, server: Server) -> None:
     errors = dashboard.errors()
-    logged = len(server.sent())
+    logged = len(sent_by(server))
     with dashboard.watch.answers("/write-line") as answers:
         dashboard.button("Tool Supply", "ATTACH").click(timeout=PATIENCE)
         dashboard.expect_busy(re.compile(r"\d+ commands in queue"))
@@ -606,7 +608,7 @@ def test_tool_supply_attaches_in_one_burst(dashboard: Dashboard, server: Toolpos
     sent = [request["line"] for request, _ in answers if request["line"] != "?pos"]
     assert len(sent) >= 130
     assert all(answer["ok"] for _, answer in answers)
-    done = commands(server.sent()[logged:])
+    done = commands(sent_by(server)[logged:])
     assert Counter(done) == Counter(sent)
     insert = [line for line in sent if re.fullmatch(r"G0 X\S+ Y\S+ Z\S+", line)]
     assert [line for line in done if line in insert] == insert, "not in the order of arrival"
@@ -648,7 +650,7 @@ def test_scan_measures_a_surface(dashboard: Dashboard) -> None:
     assert dashboard.errors() == errors
 
 
-def test_page_sees_the_server_go_and_come_back(dashboard: Dashboard, server: Toolpost) -> None:
+def test_page_sees_the_server_go_and_come_back(dashboard: Dashboard, server: Server) -> None:
     dashboard.paste_job(["G1 X1"])
     dashboard.expect_newest_job("COMPLETED")
     jobs = dashboard.job_statuses()
@@ -657,7 +659,7 @@ def test_page_sees_the_server_go_and_come_back(dashboard: Dashboard, server: Too
         assert server.stop() == 0
         expect(dashboard.status).to_have_text("⚫ offline", timeout=PATIENCE)
         expect(dashboard.button("Jog", "X+")).to_be_disabled()
-        server.start(listeners=2)
+        server.start()
         dashboard.expect_idle()
         # A failed request ends the page's own polling of the position until it is loaded again.
         dashboard.page.reload()
@@ -683,6 +685,7 @@ def test_screenshots(dashboard: Dashboard) -> None:
     dashboard.paste_job([f"G1 X{i % 7} Y{i}" for i in range(100)])
     dashboard.expect_busy(re.compile(r"Job \S+ running"))
     dashboard.expect_newest_job("RUNNING")
+    page.evaluate("scrollTo(0, 0)")
     page.screenshot(path=target / "shell-dashboard-busy.png", full_page=True)
     dashboard.expect_newest_job("COMPLETED")
     page.wait_for_timeout(1_500)
@@ -690,6 +693,7 @@ def test_screenshots(dashboard: Dashboard) -> None:
     dashboard.errors()
     dashboard.expect_idle()
     page.wait_for_timeout(1_500)
+    page.evaluate("scrollTo(0, 0)")
     page.screenshot(path=target / "shell-dashboard-idle.png", full_page=True)
     for heading in page.locator(".widget h1").all_inner_texts():
         name = heading.lower().replace(" ", "-")

@@ -2,8 +2,8 @@
 
 Browsers are the danger on a loopback listener: a page of any site may send requests to it, and a hostile
 name server may make its own name point here. So the ``Host`` must be a name of this server, and an
-``Origin``, where there is one, must be allowed. On any other listener a key is required as well; an address is never
-taken for an identity, except for networks that the configuration opens in so many words.
+``Origin``, where there is one, must be allowed. On any other listener a key is required as well; an
+address is never taken for an identity, except for networks that the configuration opens in so many words.
 """
 
 import ipaddress

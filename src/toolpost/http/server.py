@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import ipaddress
+import logging
 import socket
 from collections.abc import Iterator
 from typing import Any, Final
@@ -14,11 +15,19 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from toolpost.config import Address
 from toolpost.errors import StartError
 
+log = logging.getLogger(__name__)
+
 MAX_HEAD: Final = 32 * 1024
 """Bytes of a request's first line and headers together."""
 
 HEAD_TIMEOUT: Final = 15.0
-"""Seconds within which the head of a connection's first request must have come."""
+"""Seconds within which the head of a request must have come once it has begun."""
+
+STALL_TIMEOUT: Final = 30.0
+"""Seconds for which a client may leave its answer unread."""
+
+MAX_UNREAD: Final = 64 * 2**20
+"""Bytes of answers that all clients together may leave unread."""
 
 _KEEP_ALIVE: Final = 75
 _BACKLOG: Final = 256
@@ -26,17 +35,27 @@ _GRACE: Final = 2
 
 
 class BoundedProtocol(HttpToolsProtocol):
-    """uvicorn's HTTP protocol; a head that is too long or does not come ends the connection."""
+    """uvicorn's HTTP protocol, which ends connections that would cost too much.
+
+    Those are connections whose head is too long or does not come, and those that do not read their answers.
+    """
+
+    unread = 0
+    """Bytes of answers that clients of all connections have not read."""
 
     def connection_made(self, transport: Any) -> None:  # noqa: ANN401  # as the base class has it
         """Begin to wait for the first head."""
         super().connection_made(transport)
         self._head_bytes = 0
-        self._head_timer = asyncio.get_running_loop().call_later(HEAD_TIMEOUT, transport.close)
+        self._own_unread = 0
+        self._stall_timer: asyncio.TimerHandle | None = None
+        self._head_timer: asyncio.TimerHandle | None = None
+        self._wait_for_head()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Forget the timer."""
-        self._head_timer.cancel()
+        """Forget the timers."""
+        self._stop_waiting_for_head()
+        self._count_unread(0)
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
@@ -45,17 +64,49 @@ class BoundedProtocol(HttpToolsProtocol):
         super().data_received(data)
         if self._head_bytes > MAX_HEAD and not self.transport.is_closing():
             self.send_400_response("the request's head is too long")
+        elif self._head_bytes > 0 and self._head_timer is None:
+            self._wait_for_head()
 
     def on_headers_complete(self) -> None:
-        """The head is there; what follows is counted as the body."""
-        self._head_timer.cancel()
+        """The head is there; what follows belongs to the body."""
+        self._stop_waiting_for_head()
         self._head_bytes = -(1 << 62)
         super().on_headers_complete()
 
     def on_message_complete(self) -> None:
-        """The next head begins."""
+        """What follows belongs to the next head."""
         self._head_bytes = 0
         super().on_message_complete()
+
+    def pause_writing(self) -> None:
+        """The client reads slower than it is answered."""
+        super().pause_writing()
+        self._count_unread(self.transport.get_write_buffer_size())
+        if BoundedProtocol.unread > MAX_UNREAD:
+            log.warning("%s: does not read its answers; disconnected", self.client)
+            self.transport.abort()
+        else:
+            self._stall_timer = asyncio.get_running_loop().call_later(STALL_TIMEOUT, self.transport.abort)
+
+    def resume_writing(self) -> None:
+        """The client has read nearly all."""
+        self._count_unread(0)
+        super().resume_writing()
+
+    def _count_unread(self, size: int) -> None:
+        BoundedProtocol.unread += size - self._own_unread
+        self._own_unread = size
+        if self._stall_timer is not None:
+            self._stall_timer.cancel()
+            self._stall_timer = None
+
+    def _wait_for_head(self) -> None:
+        self._head_timer = asyncio.get_running_loop().call_later(HEAD_TIMEOUT, self.transport.close)
+
+    def _stop_waiting_for_head(self) -> None:
+        if self._head_timer is not None:
+            self._head_timer.cancel()
+            self._head_timer = None
 
 
 class Listener(uvicorn.Server):

@@ -23,7 +23,7 @@ def tcp_opener(host: str, port: int) -> Opener:
                 )[0]
                 sock = await _connect(socket.socket(family, kind, proto), address)
         except OSError as error:
-            raise LinkError(f"tcp://{host}:{port}: {error.strerror or error}") from None
+            raise LinkError(f"tcp://{host}:{port}: {error.strerror or 'no answer'}") from None
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         return socket_link(sock, listener)
 
@@ -38,7 +38,7 @@ def unix_opener(path: Path) -> Opener:
             async with asyncio.timeout(_CONNECT_TIMEOUT):
                 sock = await _connect(socket.socket(socket.AF_UNIX), str(path))
         except OSError as error:
-            raise LinkError(f"unix:{path}: {error.strerror or error}") from None
+            raise LinkError(f"unix:{path}: {error.strerror or 'no answer'}") from None
         return socket_link(sock, listener)
 
     return open_unix

@@ -1,5 +1,6 @@
 """The lock of a data directory: one server at a time."""
 
+import contextlib
 import fcntl
 import os
 from pathlib import Path
@@ -31,8 +32,10 @@ class DirectoryLock:
             raise StartError(
                 f"data directory {directory}: another Toolpost (process {owner}) uses it"
             ) from None
-        os.ftruncate(self._fd, 0)
-        os.pwrite(self._fd, f"{os.getpid()}\n".encode(), 0)
+        # Only words for the next one who asks: a full disk must not stop the server here.
+        with contextlib.suppress(OSError):
+            os.ftruncate(self._fd, 0)
+            os.pwrite(self._fd, f"{os.getpid()}\n".encode(), 0)
 
     def close(self) -> None:
         """Let go of the directory."""

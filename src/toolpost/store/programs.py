@@ -1,5 +1,6 @@
 """Programs on disk: one immutable file for each content, named by its hash."""
 
+import contextlib
 import hashlib
 import os
 import secrets
@@ -98,7 +99,11 @@ class ProgramReader:
         self._cut = b""
         self._ended = False
         os.posix_fadvise(self._file.fileno(), 0, 0, os.POSIX_FADV_SEQUENTIAL)
-        self._read()
+        try:
+            self._look_ahead()
+        except BaseException:
+            self._file.close()
+            raise
 
     @property
     def exhausted(self) -> bool:
@@ -106,21 +111,31 @@ class ProgramReader:
         return self._ended and self._next >= len(self._commands)
 
     def take(self, most: int) -> list[bytes]:
-        """Return the next commands, at most `most`; an empty list only after the last one."""
+        """Return the next commands, at most `most`; an empty list only after the last one.
+
+        Raises:
+            StorageError: the file cannot be read. No command is left out by that.
+        """
+        self._look_ahead()
         taken = self._commands[self._next : self._next + most]
         self._next += len(taken)
-        if self._next >= len(self._commands) and not self._ended:
-            self._read()
+        # What cannot be read is told when it is asked for: these commands are not lost.
+        with contextlib.suppress(StorageError):
+            self._look_ahead()
         return taken
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
 
-    def _read(self) -> None:
-        self._commands, self._next = [], 0
-        while not self._commands and not self._ended:
-            data = self._file.read(_READ_SIZE)
+    def _look_ahead(self) -> None:
+        """Have the next command in memory, or know that there is none."""
+        while self._next >= len(self._commands) and not self._ended:
+            try:
+                data = self._file.read(_READ_SIZE)
+            except OSError as error:
+                raise StorageError(f"the program cannot be read: {error.strerror}") from None
+            self._next = 0
             self._ended = len(data) == 0
             self._commands = (self._cut + data).split(b"\n")
             self._cut = self._commands.pop()

@@ -16,6 +16,7 @@ BLOCK = 64 * 1024
 
 _BORDER = re.compile(rb'"\s*,\s*(?=")')
 _DECODER = msgspec.json.Decoder(list[str])
+_ERRORS = (msgspec.DecodeError, UnicodeDecodeError)
 
 
 def decode_blocks(array: memoryview, block: int = BLOCK) -> Iterator[list[str]]:
@@ -36,7 +37,7 @@ def decode_blocks(array: memoryview, block: int = BLOCK) -> Iterator[list[str]]:
         part = (b"[" if start else b"") + array[start : border.start() + 1] + b"]"
         try:
             lines = _DECODER.decode(part)
-        except msgspec.DecodeError:
+        except _ERRORS:
             yield _decode(array)[done:]
             return
         yield lines
@@ -45,7 +46,7 @@ def decode_blocks(array: memoryview, block: int = BLOCK) -> Iterator[list[str]]:
     rest = (b"[" + array[start:]) if start else array
     try:
         lines = _DECODER.decode(rest)
-    except msgspec.DecodeError:
+    except _ERRORS:
         lines = _decode(array)[done:]
     yield lines
 
@@ -53,6 +54,6 @@ def decode_blocks(array: memoryview, block: int = BLOCK) -> Iterator[list[str]]:
 def _decode(array: memoryview) -> list[str]:
     try:
         return _DECODER.decode(array)
-    except msgspec.DecodeError as error:
+    except _ERRORS as error:
         text = str(error).replace(" - at `$", " - at `commands")
         raise InvalidRequestError(f"commands: {text}") from None

@@ -95,6 +95,8 @@ class Call:
             raise InvalidRequestError(_named(str(error))) from None
         except (msgspec.DecodeError, UnicodeDecodeError) as error:
             raise InvalidRequestError(f"invalid JSON: {error}") from None
+        except RecursionError:
+            raise InvalidRequestError("invalid JSON: it is nested too deeply") from None
 
 
 def _named(message: str) -> str:

@@ -20,8 +20,11 @@ class LineFramer:
 
     def feed(self, data: bytes) -> list[bytes]:
         """Return the lines that `data` completes, as they came, without LF."""
-        lines = (self._rest + data).split(b"\n")
+        block = self._rest + data
+        lines = block.split(b"\n")
         self._rest = lines.pop()
+        if len(block) > MAX_LINE:
+            lines = [line[:MAX_LINE] for line in lines]
         if self._overlong and lines:
             self._overlong = False
             del lines[0]

@@ -16,6 +16,7 @@ class Polls:
         self._lines = lines
         self._send = send
         self._timers: dict[str, asyncio.TimerHandle] = {}
+        self._canceled = False
 
     def start(self) -> None:
         """Send every line and go on until `cancel`."""
@@ -24,13 +25,16 @@ class Polls:
             self._fire(line.encode("ascii"), line, interval, now)
 
     def cancel(self) -> None:
-        """Send no more."""
+        """Send no more; may be called from `send`, which may find the link gone."""
+        self._canceled = True
         for timer in self._timers.values():
             timer.cancel()
         self._timers.clear()
 
     def _fire(self, payload: bytes, line: str, interval: float, due: float) -> None:
-        self._send(payload)
+        if self._canceled:
+            return
         loop = asyncio.get_running_loop()
         due = max(due + interval, loop.time())
         self._timers[line] = loop.call_at(due, self._fire, payload, line, interval, due)
+        self._send(payload)

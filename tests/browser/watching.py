@@ -1,16 +1,11 @@
-"""What the browser tests stand on: a static site, a Toolpost process and a watch over a page."""
+"""What the browser tests stand on: a static site, and a watch over a page."""
 
 import contextlib
 import functools
 import http.server
 import os
-import queue
-import signal
 import socket
-import subprocess
-import sys
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
@@ -28,12 +23,6 @@ CHROMIUM_FLAGS = [
     "--disable-component-update",
     "--disable-sync",
 ]
-
-
-def free_port() -> int:
-    """A TCP port of 127.0.0.1 that nobody listens on."""
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        return int(probe.getsockname()[1])
 
 
 def port_taken(port: int) -> bool:
@@ -78,100 +67,6 @@ class StaticSite:
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
-
-
-class Toolpost:
-    """``toolpost serve`` as a process, with its configuration and data in one folder.
-
-    It can be stopped and started again on the same data.
-    """
-
-    def __init__(self, folder: Path, config: str) -> None:
-        self._data = folder / "data"
-        self._config = folder / "toolpost.toml"
-        self._config.write_text(config)
-        self._folder = folder
-        self._process: subprocess.Popen[str] | None = None
-        self._reader: threading.Thread | None = None
-        self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
-        self.output: list[str] = []
-
-    def start(self, listeners: int, timeout: float = 20.0) -> None:
-        """Returns when that many listeners are ready; ``timeout`` is in seconds."""
-        assert self._process is None, "already running"
-        command = [sys.executable, "-m", "toolpost", "serve"]
-        command += ["--config", os.fspath(self._config), "--data", os.fspath(self._data)]
-        self._process = subprocess.Popen(
-            command,
-            cwd=self._folder,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            encoding="utf-8",
-            errors="replace",
-        )
-        self._reader = threading.Thread(target=self._read, args=(self._process,), daemon=True)
-        self._reader.start()
-        deadline = time.monotonic() + timeout
-        ready = 0
-        while ready < listeners:
-            try:
-                line = self._lines.get(timeout=max(0.0, deadline - time.monotonic()))
-            except queue.Empty:
-                self._fail(f"only {ready} of {listeners} listeners were ready after {timeout} s")
-            if line is None:
-                self._fail("ended before it was ready")
-            ready += line.startswith("toolpost: ready on http://")
-
-    def stop(self, timeout: float = 15.0) -> int:
-        """Sends SIGTERM and returns the exit status; ``timeout`` is in seconds."""
-        process = self._process
-        assert process is not None, "not running"
-        process.send_signal(signal.SIGTERM)
-        try:
-            status = process.wait(timeout)
-        except subprocess.TimeoutExpired:
-            self._fail(f"did not end within {timeout} s of SIGTERM")
-        self._reap()
-        return status
-
-    def sent(self) -> list[str]:
-        """Every line that went to the machine so far, by the comm log of this data folder."""
-        lines: list[str] = []
-        for path in sorted((self._data / "logs").rglob("*.log")):
-            for line in path.read_text("ascii").splitlines():
-                _date, _clock, direction, payload = line.split(" ", 3)
-                if direction == "down":
-                    lines.append(payload)
-        return lines
-
-    def kill(self) -> None:
-        """Ends the process, if there is one, whatever it does."""
-        if self._process is not None:
-            self._process.kill()
-            self._reap()
-
-    def _reap(self) -> None:
-        assert self._process is not None
-        assert self._reader is not None
-        self._process.wait()
-        self._reader.join(timeout=5)
-        assert self._process.stdout is not None
-        self._process.stdout.close()
-        self._process = self._reader = None
-        self._lines = queue.SimpleQueue()
-
-    def _read(self, process: subprocess.Popen[str]) -> None:
-        assert process.stdout is not None
-        for line in process.stdout:
-            self.output.append(line.rstrip("\n"))
-            self._lines.put(line)
-        self._lines.put(None)
-
-    def _fail(self, why: str) -> None:
-        self.kill()
-        raise AssertionError("\n".join([f"toolpost serve: {why}", *self.output[-40:]]))
 
 
 class Watch:
