@@ -8,7 +8,7 @@ from pathlib import Path
 from starlette.routing import BaseRoute, Mount, Router
 
 from toolpost.commlog import CommLog
-from toolpost.config import Address, Config, machine_addresses, main_addresses
+from toolpost.config import Address, Config, machine_addresses, main_addresses, without_effect
 from toolpost.dialects.spooler.api import SpoolerApi
 from toolpost.dialects.spooler.routes import spooler_routes
 from toolpost.events import Events
@@ -79,6 +79,8 @@ class App:
         lock = DirectoryLock(self._data)
         self._undo.append(lock.close)
         parse_networks(self._config.server)
+        for key in without_effect(self._config):
+            log.warning("%s has no effect yet", key)
         store = Store(self._data)
         self._undo.append(store.close)
         telemetry = Telemetry.open(self._data, self._config.telemetry)

@@ -11,6 +11,7 @@ import contextlib
 import logging
 import os
 import queue
+import re
 import threading
 import time
 from pathlib import Path
@@ -191,12 +192,7 @@ class _Files:
 
     def _open(self, day: str) -> None:
         self.close()
-        number = 1
-        while True:
-            path = self._directory / f"{self._machine}-{day}-{number:04}.log"
-            if not path.exists() or path.stat().st_size < self._limits.file_bytes:
-                break
-            number += 1
+        path = self._next_path(day)
         self._fd = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o640)
         self._size = os.fstat(self._fd).st_size
         self._day = day
@@ -204,12 +200,29 @@ class _Files:
             os.write(self._fd, b"\n")
         self._trim(path)
 
+    def _next_path(self, day: str) -> Path:
+        """Return the day's last file, or the one after it if that is full; numbers are never used again."""
+        latest = max((key for key in self._files() if key[0] == day), default=(day, 1))
+        path = self._path(*latest)
+        if path.exists() and path.stat().st_size >= self._limits.file_bytes:
+            return self._path(day, latest[1] + 1)
+        return path
+
+    def _path(self, day: str, number: int) -> Path:
+        return self._directory / f"{self._machine}-{day}-{number:04}.log"
+
+    def _files(self) -> list[tuple[str, int]]:
+        """Return day and number of every file of this machine, the newest first."""
+        name = re.compile(re.escape(self._machine) + r"-(\d{4}-\d\d-\d\d)-(\d{4,})\.log")
+        matches = (name.fullmatch(path.name) for path in self._directory.iterdir())
+        return sorted(((match[1], int(match[2])) for match in matches if match), reverse=True)
+
     def _trim(self, current: Path) -> None:
         """Delete what is beyond the bounds, the oldest first; never the present file."""
         oldest = time.time() - self._limits.max_age_days * 86400
-        files = sorted(self._directory.glob(f"{self._machine}-*.log"), reverse=True)
         total = self._limits.file_bytes
-        for path in files:
+        for key in self._files():
+            path = self._path(*key)
             if path == current:
                 continue
             stat = path.stat()

@@ -20,6 +20,8 @@ from toolpost.telemetry.limits import Limits as TelemetryLimits
 DRIVERS: Final = ("spark",)
 """The drivers of this version."""
 
+_NOT_YET: Final = ("automatic_transition", "job_transition_delay", "job_transition_gcode", "bed")
+
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 _ADDRESS = re.compile(r"(?:\[(?P<ipv6>[0-9a-fA-F:.]+)\]|(?P<host>[^\[\]:]+)):(?P<port>\d{1,5})")
 
@@ -222,6 +224,17 @@ def main_addresses(config: ServerConfig) -> list[Address]:
 def machine_addresses(name: str, config: MachineConfig) -> list[Address]:
     """Return the addresses at which a machine alone is at the root."""
     return [parse_address(text, f"machines.{name}.listen") for text in config.listen]
+
+
+def without_effect(config: Config) -> list[str]:
+    """Return the keys whose values ask for what this version does not do yet."""
+    plain = QueueConfig()
+    return [
+        f"machines.{name}.queue.{key}"
+        for name, machine in config.machines.items()
+        for key in _NOT_YET
+        if getattr(machine.queue, key) != getattr(plain, key)
+    ]
 
 
 T = TypeVar("T")

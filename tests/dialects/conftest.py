@@ -4,8 +4,8 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import pytest
-
 from tests.harness import Client, Port, Server, spark_config, wait_until
+
 from toolpost.sim.spark import SparkOptions
 
 ENDED = {"COMPLETED", "CANCELED", "FAILED"}

@@ -4,8 +4,8 @@ import re
 import time
 
 import pytest
-
 from tests.harness import Port, Server, wait_until
+
 from toolpost.sim.spark import SparkOptions
 
 # /write-line
@@ -292,7 +292,19 @@ def test_latest_in_the_window_is_taken_and_nothing_is_made_up(bench):
 
 def test_every_kind_of_value_and_unknown_keys(bench):
     at = bench.say('kinds < f:0.5 s:"on" b:true h:0x10 nan:nan >')["time"]
-    keys = ["kinds.f", "kinds.s", "kinds.b", "kinds.h", "kinds.nan", "kinds.x", "kinds", "x", "", ".", "a.b.c"]
+    keys = [
+        "kinds.f",
+        "kinds.s",
+        "kinds.b",
+        "kinds.h",
+        "kinds.nan",
+        "kinds.x",
+        "kinds",
+        "x",
+        "",
+        ".",
+        "a.b.c",
+    ]
     values = series(bench, at, at, 1, *keys)[1]
     assert [values[key] for key in keys] == [[v] for v in [0.5, "on", True, 16, None] + [None] * 6]
 
@@ -315,7 +327,14 @@ def test_position_that_the_core_reports(bench):
 
 @pytest.mark.parametrize(
     ("start", "end", "step", "count"),
-    [(0, 0, 1, 1), (0, 1, 2, 1), (0, 1, 1, 2), (0, 0.3, 0.1, 4), (1735689600, 1735689601, 0.3, 4), (5, 6, 0.999, 2)],
+    [
+        (0, 0, 1, 1),
+        (0, 1, 2, 1),
+        (0, 1, 1, 2),
+        (0, 0.3, 0.1, 4),
+        (1735689600, 1735689601, 0.3, 4),
+        (5, 6, 0.999, 2),
+    ],
 )
 def test_times_go_from_start_to_end(bench, start, end, step, count):
     times, values = series(bench, start, end, step, "queue.num")
@@ -398,7 +417,8 @@ def test_a_machines_own_listener_serves_it_alone(two, path):
 
 
 @pytest.mark.parametrize(
-    "path", ["/machines/none/status", "/machines/", "/machines", "/machines/mill", "/machines/mill/", "/Status"]
+    "path",
+    ["/machines/none/status", "/machines/", "/machines", "/machines/mill", "/machines/mill/", "/Status"],
 )
 def test_unknown_paths_are_404(two, path):
     answer = two[0].client.post(path, {})
@@ -410,7 +430,7 @@ def test_failed_job_is_called_as_the_machine_is_configured(two):
     server, edm, mill = two
     for port, client, word in ((edm, server.client, "FAILED"), (mill, server.client_of(1), "CANCELED")):
         assert client.call("/add-job", commands=["G4 P10"])["ok"]
-        wait_until(lambda c=client: "running_job" in c.call("/status"))
+        wait_until(lambda p=port: p.core.queue_length)
         port.inject("reboot")
         wait_until(lambda c=client: "time_ended" in c.call("/list-jobs")["jobs"][-1])
         job = client.call("/list-jobs")["jobs"][-1]

@@ -12,7 +12,9 @@ from tests.harness import Port, Server, spark_config, wait_until
 from toolpost.sim.spark import SparkOptions
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "spooler.jsonl"
-RECORDS = [record for line in GOLDEN.read_text("utf-8").splitlines() if "request" in (record := json.loads(line))]
+RECORDS = [
+    record for line in GOLDEN.read_text("utf-8").splitlines() if "request" in (record := json.loads(line))
+]
 ENDED = {"COMPLETED", "CANCELED", "FAILED"}
 LOOSE = {"time", "now", "job_id", "time_added", "time_started", "time_ended", "kv"}
 

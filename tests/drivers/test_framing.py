@@ -1,37 +1,55 @@
 import itertools
 
-from hypothesis import given
+import pytest
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from toolpost.drivers.spark import framing
 from toolpost.drivers.spark.framing import MAX_LINE, LineFramer, content
 
+SHORT = 50
 pieces = st.one_of(
     st.binary(max_size=20),
-    st.sampled_from([b"\n", b"\r\n", b"queue < cap:100 num:5 >\n", b"\x08 \x08", b"x" * MAX_LINE, b"y" * 1000]),
+    st.sampled_from([b"\n", b"\r\n", b"queue < cap:100 num:5 >\n", b"\x08 \x08", b"x" * SHORT, b"y" * 10]),
 )
 wire = st.lists(pieces, max_size=12).map(b"".join)
 
 
-@given(wire, st.lists(st.integers(0, 3 * MAX_LINE), max_size=12))
+@pytest.fixture
+def _short(monkeypatch):
+    monkeypatch.setattr(framing, "MAX_LINE", SHORT)
+
+
+short = pytest.mark.usefixtures("_short")
+shared = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+@short
+@shared
+@given(wire, st.lists(st.integers(0, 5 * SHORT), max_size=12))
 def test_chunks_do_not_matter(data, cuts):
     edges = sorted({0, len(data), *(cut for cut in cuts if cut < len(data))})
     whole = LineFramer().feed(data + b"\n")
     framer = LineFramer()
-    parts = [line for a, b in itertools.pairwise([*edges, len(data)]) for line in framer.feed(data[a:b])]
+    parts = [line for a, b in itertools.pairwise(edges) for line in framer.feed(data[a:b])]
     assert parts + framer.feed(b"\n") == whole
 
 
+@short
+@shared
 @given(wire)
 def test_every_line_arrives_cut_at_the_most(data):
-    assert LineFramer().feed(data + b"\n") == [line[:MAX_LINE] for line in data.split(b"\n")]
+    assert LineFramer().feed(data + b"\n") == [line[:SHORT] for line in data.split(b"\n")]
 
 
+@short
+@shared
 @given(wire)
 def test_a_line_without_an_end_waits(data):
     lines = LineFramer().feed(data)
     assert len(lines) - data.count(b"\n") in {0, 1}
     if len(lines) > data.count(b"\n"):
-        assert len(lines[-1]) == MAX_LINE
+        assert len(lines[-1]) == SHORT
 
 
 def test_an_endless_line_is_bounded_and_ends_at_lf():

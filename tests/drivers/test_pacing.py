@@ -1,3 +1,4 @@
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -31,7 +32,7 @@ def test_a_fuller_queue_waits_no_shorter(a, b, executed, elapsed):
 
 def test_figures():
     # 48 commands of 1 ms last 48 ms, of which half are 24.
-    assert refill_delay(48, 100, 0.1) == 0.024
+    assert refill_delay(48, 100, 0.1) == pytest.approx(0.024)
     assert refill_delay(48, 100, 0.2) == REFILL_MOST
     assert refill_delay(0, 10, 0.1) == 0
     assert refill_delay(48, 0, 0.1) == REFILL_MOST

@@ -4,7 +4,7 @@ from toolpost.drivers.spark.polls import Polls
 
 
 def run_for(seconds, lines, *, send=None, block_at=None, then=0.0):
-    """Poll for a while; return (time since the start, payload) of each line sent, and how many after `cancel`."""
+    """Poll for a while; return (time, payload) of each line, how many at once and how many after `cancel`."""
     sent = []
 
     async def main():
@@ -19,7 +19,9 @@ def run_for(seconds, lines, *, send=None, block_at=None, then=0.0):
         polls.start()
         at_once = len(sent)
         if block_at is not None:
-            loop.call_at(start + block_at, lambda: [None for _ in iter(lambda: loop.time() < start + 0.2, False)])
+            loop.call_at(
+                start + block_at, lambda: [None for _ in iter(lambda: loop.time() < start + 0.2, False)]
+            )
         await asyncio.sleep(seconds)
         polls.cancel()
         before = len(sent)

@@ -7,12 +7,12 @@ address is never taken for an identity, except for networks that the configurati
 """
 
 import ipaddress
+import re
 import socket
 import time
 from collections import OrderedDict
 from collections.abc import Callable
 from typing import Final
-from urllib.parse import urlsplit
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -21,6 +21,7 @@ from toolpost.errors import ConfigError
 from toolpost.http.answer import CORS_METHODS, send_answer, send_text
 
 _LOCAL_NAMES: Final = frozenset({"localhost", "127.0.0.1", "[::1]"})
+_HOST: Final = re.compile(rb"(\[[0-9a-f:.]+\]|[^\[\]:@/]+)(?::[0-9]*)?")
 _SIMPLE_TYPES: Final = (b"text/plain", b"application/x-www-form-urlencoded", b"multipart/form-data")
 _BROWSER_HEADERS: Final = frozenset({b"origin", b"sec-fetch-site", b"sec-fetch-mode"})
 
@@ -186,7 +187,8 @@ def _read_headers(
     browser = False
     for name, value in scope["headers"]:
         if name == b"host":
-            host = value
+            # A second one is refused as no name at all (RFC 9112, section 3.2).
+            host = value if host is None else b""
         elif name == b"content-type":
             content_type = value
         elif name == b"x-api-key":
@@ -208,17 +210,14 @@ def _is_simple(content_type: bytes | None, browser: bool) -> bool:
 
 
 def _hostname(host: bytes) -> str:
-    text = host.decode("latin-1").lower()
-    if text.startswith("["):
-        return text[: text.find("]") + 1]
-    return text.partition(":")[0]
+    """Return the name in ``name[:port]``, IPv6 addresses in their brackets; "" if it is malformed."""
+    match = _HOST.fullmatch(host.lower())
+    return match[1].decode("latin-1") if match else ""
 
 
 def _origin_host(origin: str) -> str:
-    parts = urlsplit(origin)
-    if parts.scheme not in {"http", "https"}:
-        return ""
-    return _hostname(parts.netloc.encode("latin-1"))
+    scheme, _, netloc = origin.partition("://")
+    return _hostname(netloc.encode("latin-1")) if scheme in {"http", "https"} else ""
 
 
 def _same_origin(origin: str, host: bytes) -> bool:

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from typing import Any, Final
 
 import uvicorn
+from httptools import HttpParserError
 from starlette.types import ASGIApp
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
@@ -69,6 +70,9 @@ class BoundedProtocol(HttpToolsProtocol):
 
     def on_headers_complete(self) -> None:
         """The head is there; what follows belongs to the body."""
+        # One that has come in one piece was not counted.
+        if len(self.url) + sum(len(name) + len(value) + 4 for name, value in self.headers) > MAX_HEAD:
+            raise HttpParserError("the request's head is too long")
         self._stop_waiting_for_head()
         self._head_bytes = -(1 << 62)
         super().on_headers_complete()

@@ -44,7 +44,7 @@ class _Port:
 
     def close(self) -> None:
         # What a dead device has not taken would otherwise hold up the close for half a minute.
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, termios.error):
             termios.tcflush(self._serial.fileno(), termios.TCIOFLUSH)
         with contextlib.suppress(OSError):
             self._serial.close()

@@ -51,7 +51,7 @@ class SparkOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
             command takes any.
         realtime_moves: G0 and G1 take the time that their distance and feed give, and
             ``command_time`` is for all others.
-        answer_delay: seconds until the answer to a signal is sent.
+        answer_delay: seconds until the answer to a signal, to ``get`` or ``stat`` is sent.
         hold_off: seconds after ``!`` in which all but ``?`` signals is ignored; 0 for the older
             firmware, which has no such time.
         boot_message: ``sys`` (newer firmware), ``init`` (older) or ``none``.
@@ -476,10 +476,10 @@ class SparkCore:
         if line[:4] == b"set ":
             self._set(line)
         elif line[:3] == b"get":
-            self._up(replies.settings_report(self.settings))
+            self._answer(replies.settings_report(self.settings))
         elif line[:4] == b"stat":
             seconds = self._clock() - self._booted_at
-            self._up(replies.statistics(self.executed, seconds))
+            self._answer(replies.statistics(self.executed, seconds))
         self._start_next()
         if self._faults.counting:
             self._faults.on_executed(self.executed)

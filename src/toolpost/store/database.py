@@ -106,8 +106,10 @@ class Database:
                 connection.execute("SAVEPOINT change")
                 try:
                     change.result = change.apply(connection)
-                except Exception as error:  # noqa: BLE001  # whatever it is, the caller is told
+                except Exception as error:  # whatever it is, the caller is told
                     change.error = error
+                    if not connection.in_transaction:
+                        raise  # On a full disk SQLite rolls the whole transaction back by itself.
                     connection.execute("ROLLBACK TO change")
                 connection.execute("RELEASE change")
             connection.execute("COMMIT")

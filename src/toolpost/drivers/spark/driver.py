@@ -62,7 +62,8 @@ class SparkDriver:
         self._parser = PStateParser()
         self._ending: asyncio.Future[Ending] | None = None
         self._polls: Polls | None = None
-        self._connected_at = 0.0
+        self._connected_at = self._loop.time()
+        self._link_gone = False
         self._silent_since: float | None = None
         self._alive = False
         self._fault = False
@@ -96,7 +97,7 @@ class SparkDriver:
     @property
     def accepting(self) -> bool:
         """Whether the core would take commands: it answers, or has had no time to answer yet."""
-        if self._link is None or self._fault:
+        if self._fault or self._link_gone:
             return False
         return self._alive or self._loop.time() - self._connected_at < self._options.answer_timeout
 
@@ -121,7 +122,9 @@ class SparkDriver:
 
     def enqueue(self, line: bytes) -> bool:
         """Send a command behind all earlier ones; False if the core cannot take it."""
-        return self.accepting and not self._sender.running and self._sender.enqueue(line)
+        if self._link is None or not self.accepting or self._sender.running:
+            return False
+        return self._sender.enqueue(line)
 
     def send_now(self, line: bytes) -> bool:
         """Send a line ahead of all unsent commands; False if it cannot be sent."""
@@ -139,6 +142,7 @@ class SparkDriver:
             return await self._ending
         finally:
             self._ending = None
+            self._sender.taken = 0
 
     def stop(self) -> None:
         """Stop the sender, drop what is unsent, then write ``!``; never the other way round."""
@@ -174,6 +178,7 @@ class SparkDriver:
                 self._lost.clear()
                 self._link = await self._opener(self)
             except LinkError as error:
+                self._link_gone = True
                 if str(error) != failure:
                     failure = str(error)
                     log.warning("%s: %s; trying again", self._name, failure)
@@ -204,7 +209,7 @@ class SparkDriver:
         self._parser = PStateParser()
         self._connected_at = self._loop.time()
         self._silent_since = None
-        self._fault = False
+        self._fault = self._link_gone = False
         self._sender.attach(link)
         self._listener.session_started()
         self._listener.changed()
@@ -215,6 +220,7 @@ class SparkDriver:
         log.warning("%s: link lost: %s; it will be reopened", self._name, reason)
         self._comm.note(f"link lost: {reason}")
         self._link = None
+        self._link_gone = True
         self._alive = False
         self._sender.detach()
         self._cancel_ticker()
@@ -289,6 +295,9 @@ class SparkDriver:
         log.log(logging.WARNING if working else logging.INFO, "%s: the core has booted", self._name)
         self._comm.note("the core has booted: what it held is gone")
         self._fault = False
+        if working:
+            # What was on its way when the core booted would be executed by the fresh one.
+            self._sender.stop_owed = True
         self._end_work(Ending(Outcome.FAILED, Reason.MACHINE_RESET, "the core has booted"))
         self._sender.reset()
         self._listener.session_started()

@@ -9,7 +9,7 @@ HEARTBEAT = 0.25
 REFILL_MOST = 0.025
 """Longest wait while commands are unsent: half of what 48 commands of 1 ms last."""
 
-DRAIN_MOST = 0.008
+DRAIN_MOST = 0.006
 """Longest wait for the end of the last command: it bounds how late a job is seen to be completed."""
 
 

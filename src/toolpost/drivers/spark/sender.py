@@ -33,7 +33,7 @@ class Sender:
         free: called when the hold-off after a stop is over.
 
     Attributes:
-        taken: commands of the present source that have been sent.
+        taken: commands of the present run that have been sent; 0 between two runs.
         asked_at: when the last question was asked (loop time).
         stop_owed: whether a stop has to be sent as soon as there is a link.
     """
@@ -132,7 +132,6 @@ class Sender:
     def run(self, source: LineSource) -> None:
         """Send all commands of a source."""
         self._source = source
-        self.taken = 0
         self._idle_answers = 0
         self.pump()
         self._ask_if_none()
