@@ -9,7 +9,6 @@ import pytest
 from tests.harness import Server, spark_config
 from toolpost.config import DEFAULT, Address, load, main_addresses, parse, parse_address
 from toolpost.errors import ConfigError
-from toolpost.http.gate import parse_networks
 from toolpost.http.server import is_loopback
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -222,9 +221,32 @@ def test_file_that_cannot_be_read(tmp_path):
 
 @pytest.mark.parametrize("network", ["x", "192.168.1.5/24", "10.0.0.0/33", ""])
 def test_bad_network(network):
-    config = config_of(f'[server]\nopen_networks = ["{network}"]\n{MACHINE}')
     with pytest.raises(ConfigError, match=r"server\.open_networks: .*192\.168\.1\.0/24"):
-        parse_networks(config.server)
+        config_of(f'[server]\nopen_networks = ["{network}"]\n{MACHINE}')
+
+
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        (f"{MACHINE}[machines.edm.spark]\nhold_off = -1", "machines.edm.spark.hold_off"),
+        (f"{MACHINE}[machines.edm.spark]\nhold_off = nan", "machines.edm.spark.hold_off"),
+        (f"{MACHINE}[machines.edm.spark]\nanswer_timeout = 0", "machines.edm.spark.answer_timeout"),
+        (f"{MACHINE}[machines.edm.log]\nfile_bytes = 0", "machines.edm.log.file_bytes"),
+        (f"{MACHINE}[machines.edm.sim]\nfaults = ['nonsense']", "machines.edm.sim.faults"),
+        (f"{MACHINE}[machines.edm.sim]\ncapacity = 0", "machines.edm.sim"),
+        (f"[telemetry]\nring_reports = -1\n{MACHINE}", "telemetry.ring_reports"),
+        (f"[server]\nlisten = []\n{MACHINE}", "server.listen"),
+    ],
+)
+def test_values_out_of_range(text, key):
+    with pytest.raises(ConfigError, match=f"^{re.escape(key)}: "):
+        config_of(text)
+
+
+def test_two_machines_cannot_share_a_device():
+    machine = 'driver = "spark"\nlink = "/dev/ttyACM0"\n'
+    with pytest.raises(ConfigError, match=r"machines\.b\.link: .* machines\.a already"):
+        config_of(f"[machines.a]\n{machine}[machines.b]\n{machine}")
 
 
 QUEUE_OPTIONS = {

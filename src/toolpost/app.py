@@ -1,8 +1,9 @@
 """The server put together: what is opened, in which order, and how it is let go of again."""
 
 import asyncio
+import contextlib
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from starlette.routing import BaseRoute, Mount, Router
@@ -13,7 +14,7 @@ from toolpost.dialects.spooler.api import SpoolerApi
 from toolpost.dialects.spooler.routes import spooler_routes
 from toolpost.events import Events
 from toolpost.http.body import BodyReader
-from toolpost.http.gate import Gate, parse_networks
+from toolpost.http.gate import Gate
 from toolpost.http.server import Listener, is_loopback
 from toolpost.machine import Machine
 from toolpost.shop import Shop
@@ -40,7 +41,6 @@ class App:
         self._data = data
         self._main = listen or main_addresses(config.server)
         self._stop = asyncio.Event()
-        self._undo: list[Callable[[], object]] = []
 
     def stop(self) -> None:
         """End `run`."""
@@ -56,57 +56,44 @@ class App:
             StartError: an address or the data directory is not to be had.
             ConfigError: the configuration is wrong.
         """
-        try:
-            listeners, machines = await self._open()
-            try:
-                for machine in machines:
-                    machine.start()
-                for listener in listeners:
-                    await listener.open()
-                    ready(listener.url)
-                await self._stop.wait()
-                log.info("stopping")
-            finally:
-                await asyncio.gather(*(listener.close() for listener in listeners))
-                await asyncio.gather(*(machine.stop() for machine in machines))
-        finally:
-            for undo in reversed(self._undo):
-                result = undo()
-                if asyncio.iscoroutine(result):
-                    await result
+        async with contextlib.AsyncExitStack() as opened:
+            machines, listeners = self._open(opened)
+            for machine in machines:
+                machine.start()
+            for listener in listeners:
+                await listener.open()
+                ready(listener.url)
+            await self._stop.wait()
+            log.info("stopping")
 
-    async def _open(self) -> tuple[list[Listener], list[Machine]]:
-        lock = DirectoryLock(self._data)
-        self._undo.append(lock.close)
-        parse_networks(self._config.server)
+    def _open(self, opened: contextlib.AsyncExitStack) -> tuple[list[Machine], list[Listener]]:
+        """Open everything; `opened` closes it again in the opposite order."""
         for key in without_effect(self._config):
             log.warning("%s has no effect yet", key)
+        opened.callback(DirectoryLock(self._data).close)
         store = Store(self._data)
-        self._undo.append(store.close)
+        opened.callback(store.close)
         telemetry = Telemetry.open(self._data, self._config.telemetry)
-        self._undo.append(telemetry.close)
+        opened.push_async_callback(telemetry.close)
         events = Events()
-        machines = {
-            name: Machine(
-                name,
-                config,
-                store,
-                telemetry,
-                CommLog(self._data / "logs", name, config.log),
-                events,
-            )
-            for name, config in self._config.machines.items()
-        }
+        machines = {}
+        for name, config in self._config.machines.items():
+            comm = CommLog(self._data / "logs", name, config.log)
+            opened.callback(comm.close)
+            machines[name] = Machine(name, config, store, telemetry, comm, events)
         shop = Shop(machines, store, telemetry, self._config.storage.programs_bytes)
-        try:
-            listeners = self._listeners(shop, store)
-        except BaseException:
-            for machine in machines.values():
-                await machine.stop()
-            raise
-        return listeners, list(machines.values())
+        listeners = []
+        for address, roots in self._addresses(shop):
+            listener = self._listener(address, roots, store)
+            opened.callback(listener.release)
+            listeners.append(listener)
+        opened.push_async_callback(_close_all, listeners)
+        # The machines first: a client that takes its time must not keep them moving.
+        opened.push_async_callback(_halt_all, list(machines.values()))
+        return list(machines.values()), listeners
 
-    def _listeners(self, shop: Shop, store: Store) -> list[Listener]:
+    def _addresses(self, shop: Shop) -> Iterator[tuple[Address, list[BaseRoute]]]:
+        """Yield where is listened and what is served there."""
         server = self._config.server
         bodies = BodyReader(server.max_body_bytes, server.max_body_bytes * _BODIES_AT_ONCE)
 
@@ -114,33 +101,41 @@ class App:
             failed = self._config.machines[name].spooler.failed
             return list(spooler_routes(SpoolerApi(shop, name, failed), bodies))
 
-        def listener(address: Address, roots: list[BaseRoute]) -> Listener:
-            local = is_loopback(address)
-            if not local:
-                self._warn_of_exposure(address, store)
-            router = Router(roots, redirect_slashes=False)
-            gate = Gate(router, server, local=local, key_owner=store.keys.owner)
-            opened = Listener(address, gate, server.max_connections)
-            self._undo.append(opened.release)
-            return opened
-
         main = routes(shop.machines[0])
         main += [Mount(f"/machines/{name}", routes=routes(name)) for name in shop.machines]
-        listeners = [listener(address, main) for address in self._main]
+        for address in self._main:
+            yield address, main
         for name, machine in self._config.machines.items():
-            listeners += [listener(a, routes(name)) for a in machine_addresses(name, machine)]
-        return listeners
+            for address in machine_addresses(name, machine):
+                yield address, routes(name)
 
-    def _warn_of_exposure(self, address: Address, store: Store) -> None:
+    def _listener(self, address: Address, roots: list[BaseRoute], store: Store) -> Listener:
+        server = self._config.server
+        local = is_loopback(address)
+        router = Router(roots, redirect_slashes=False)
+        gate = Gate(router, server, local=local, key_owner=store.keys.owner)
+        listener = Listener(address, gate, server.max_connections)
+        if not local:
+            self._warn_of_exposure(listener.url, store)
+        return listener
+
+    def _warn_of_exposure(self, url: str, store: Store) -> None:
         networks = self._config.server.open_networks
         if networks:
             log.warning(
                 "%s: ANYONE in %s can move the machines: no key is asked for there (server.open_networks)",
-                address,
+                url,
                 ", ".join(networks),
             )
         elif not store.keys.names():
             log.warning(
-                "%s: nobody can come in: there is no API key; make one with `toolpost key add NAME`",
-                address,
+                "%s: nobody can come in: there is no API key; make one with `toolpost key add NAME`", url
             )
+
+
+async def _halt_all(machines: list[Machine]) -> None:
+    await asyncio.gather(*(machine.halt() for machine in machines))
+
+
+async def _close_all(listeners: list[Listener]) -> None:
+    await asyncio.gather(*(listener.close() for listener in listeners))

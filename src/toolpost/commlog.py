@@ -15,14 +15,19 @@ import re
 import threading
 import time
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
+from msgspec import Meta
 
 log = logging.getLogger(__name__)
 
 _FLUSH_AFTER = 0.02
 _SYNC_EVERY = 1.0
 _PRINTABLE = bytes(range(0x20, 0x7F)) + b"\n"
+
+
+_Bytes = Annotated[int, Meta(ge=64 * 1024)]
 
 
 class CommLogLimits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -35,10 +40,10 @@ class CommLogLimits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         backlog_bytes: lines that may wait for the disk; what is beyond is dropped, and the log says so.
     """
 
-    file_bytes: int = 16 * 2**20
-    total_bytes: int = 256 * 2**20
-    max_age_days: float = 30.0
-    backlog_bytes: int = 16 * 2**20
+    file_bytes: _Bytes = 16 * 2**20
+    total_bytes: _Bytes = 256 * 2**20
+    max_age_days: Annotated[float, Meta(gt=0)] = 30.0
+    backlog_bytes: _Bytes = 16 * 2**20
 
 
 class CommLog:
@@ -68,7 +73,7 @@ class CommLog:
         """Log lines from the machine, as they came."""
         prefix = self._prefix(b"up")
         block = prefix + (b"\n" + prefix).join(lines) + b"\n"
-        if block.translate(None, _PRINTABLE):
+        if b"\\" in block or block.translate(None, _PRINTABLE):
             block = b"".join(prefix + _escaped(line) + b"\n" for line in lines)
         self._add(block)
 

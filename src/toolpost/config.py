@@ -1,6 +1,7 @@
 """The configuration: a TOML file, read strictly, with errors that name the key and the fix."""
 
 import difflib
+import ipaddress
 import re
 import tomllib
 from pathlib import Path
@@ -275,7 +276,16 @@ def _suggestion(name: str, known: set[str]) -> str:
 
 
 def _check(config: Config) -> None:
-    main_addresses(config.server)
+    if not main_addresses(config.server):
+        raise ConfigError('server.listen: there is no address; write e.g. "127.0.0.1:7125"')
+    for text in config.server.open_networks:
+        try:
+            ipaddress.ip_network(text)
+        except ValueError as error:
+            raise ConfigError(
+                f'server.open_networks: {error}; write a network such as "192.168.1.0/24"'
+            ) from None
+    links: dict[str, str] = {}
     for name, machine in config.machines.items():
         key = f"machines.{name}"
         if not _NAME.fullmatch(name):
@@ -286,6 +296,11 @@ def _check(config: Config) -> None:
                 f"{key}.driver: {machine.driver!r} is not to be had; this version drives {', '.join(DRIVERS)}"
             )
         _check_link(machine.link, f"{key}.link")
+        if machine.link != "sim" and machine.link in links:
+            raise ConfigError(
+                f"{key}.link: {machine.link} is the link of machines.{links[machine.link]} already"
+            )
+        links[machine.link] = name
         for fault in machine.sim.faults:
             try:
                 Fault.parse(fault)

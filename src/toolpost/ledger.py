@@ -11,6 +11,8 @@ import secrets
 from collections.abc import Callable, Iterator
 from functools import partial
 
+import msgspec
+
 from toolpost.clock import now_us
 from toolpost.core.job import Job, JobState, Reason, after_restart
 from toolpost.core.program import Program
@@ -131,6 +133,11 @@ class Ledger:
                 self._put(before)
             raise
         self._changed(job)
+
+    def explain(self, job: Job, reason: Reason) -> None:
+        """Say why a pending job waits; it changes with the machine, so it is not stored."""
+        if self._jobs[job.seq].state is JobState.PENDING:
+            self._put(msgspec.structs.replace(self._jobs[job.seq], reason=reason))
 
     def declare(self, job: Job, actor: str = SYSTEM) -> "asyncio.Future[None]":
         """Make a transition that has happened already; the future tells whether the disk took it at once.

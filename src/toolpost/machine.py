@@ -48,7 +48,6 @@ class Machine:
         self.config = config
         self._settings = store.settings
         self._telemetry = telemetry
-        self._comm = comm
         self._events = events
         self.init_lines: list[str] = store.settings.get(name, _INIT_LINES) or []
         self.driver: Driver = open_driver(name, config, comm, self)
@@ -72,8 +71,8 @@ class Machine:
         for task in self._tasks:
             task.add_done_callback(self._task_ended)
 
-    async def stop(self) -> None:
-        """Stop the machine if it runs a job or executes commands, then let go of it."""
+    async def halt(self) -> None:
+        """Stop the machine if it executes anything, and take no more commands."""
         job = self.ledger.active
         running = job is not None and job.state is JobState.PROCESSING
         if running or self.driver.state.execution is Execution.ACTIVE:
@@ -86,9 +85,8 @@ class Machine:
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        self.ledger.close()
         self.driver.close()
-        self._comm.close()
+        self.ledger.close()
 
     async def set_init_lines(self, lines: list[str]) -> None:
         """Set the init lines; they are on disk when this returns.

@@ -44,6 +44,9 @@ class Runner:
             if job is not None and self._driver.ready:
                 await self._run_job(job)
             else:
+                if job is not None:
+                    away = not self._driver.state.alive
+                    self._ledger.explain(job, Reason.MACHINE_OFFLINE if away else Reason.MACHINE_BUSY)
                 await self._wake.wait()
 
     async def _run_job(self, job: Job) -> None:
@@ -64,6 +67,7 @@ class Runner:
             await self._ledger.change(job.to(JobState.PROCESSING, Reason.RUNNING, now_us()))
         except StorageError as error:
             log.error("%s: job %s cannot be started: %s", self._name, job.id, error)
+            self._ledger.explain(job, Reason.STORAGE_FAILED)
             await asyncio.sleep(_RETRY_AFTER)
             return False
         return self._ledger.get(job.seq).state is JobState.PROCESSING

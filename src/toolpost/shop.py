@@ -37,11 +37,10 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Progress(msgspec.Struct, frozen=True):
-    """How far a job is, in commands: sent, executed, and all there are."""
+    """How far a job is, in commands."""
 
     sent: int
     executed: int
-    total: int
 
 
 class Shop:
@@ -63,6 +62,7 @@ class Shop:
     ) -> None:
         self._machines = machines
         self._programs = store.programs
+        self._stored_jobs = store.jobs
         self._telemetry = telemetry
         self._programs_bytes = programs_bytes
         # Each may make a large answer: so many at a time, whatever is asked.
@@ -178,14 +178,15 @@ class Shop:
         """Return a machine's jobs in the order of adding."""
         return list(self._machines[machine].ledger)
 
-    def progress(self, job: Job) -> Progress:
-        """Return how far a job is; of an ended job only the completed one is known to the end."""
+    def progress(self, job: Job) -> Progress | None:
+        """Return how far a job is; None if that is not known, as of a job that did not end well."""
         if job.state is JobState.PROCESSING:
             state = self._machines[job.machine].driver.state
             executed = max(0, state.job_sent - state.machine_commands)
-            return Progress(state.job_sent, executed, job.commands)
-        done = job.commands if job.state is JobState.COMPLETED else 0
-        return Progress(done, done, job.commands)
+            return Progress(state.job_sent, executed)
+        if job.state is JobState.COMPLETED:
+            return Progress(job.commands, job.commands)
+        return Progress(0, 0) if job.started_us is None else None
 
     def status(self, machine: str) -> Status:
         """Return a machine in brief."""
@@ -238,9 +239,11 @@ class Shop:
             return await self._telemetry.query(machine, keys, grid)
 
     def _trim_programs(self) -> None:
-        if any(self._adding.values()):
+        if any(self._adding.values()) or self._programs.size <= self._programs_bytes:
             return
+        # Jobs that are not on disk yet, and those of machines that are not configured any more.
         in_use = {job.program for m in self._machines.values() for job in m.ledger.open}
+        in_use |= self._stored_jobs.programs_in_use()
         self._programs.trim(in_use, self._programs_bytes)
 
 

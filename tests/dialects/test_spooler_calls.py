@@ -34,7 +34,7 @@ def test_line_is_trimmed_and_its_comment_stays_here(bench, received, line, sent)
 
 @pytest.mark.parametrize("line", ["", " ", ";", "; comment", "\t"])
 def test_line_without_a_payload_is_taken_and_not_sent(bench, received, line):
-    """dialects/spooler.md, section 6: the web client sends ``""`` for a line that was only a comment."""
+    """docs/reference/spooler-api.md: the web client sends ``""`` for a line that was only a comment."""
     assert bench.client.call("/write-line", line=line)["ok"] is True
     bench.client.call("/write-line", line="?pos")
     wait_until(received)
@@ -76,7 +76,7 @@ def test_while_a_job_runs_only_urgent_lines_are_taken(bench, received, request_,
 
 @pytest.mark.parametrize("line", ["!", " ! ", "! ; stop"])
 def test_bang_is_a_cancel(bench, received, line):
-    """dialects/spooler.md S18: sent alone, the rest of the job would go on."""
+    """docs/reference/spooler-api.md S18: sent alone, the rest of the job would go on."""
     assert bench.client.call("/add-job", commands=["G4 P0.2"] * 200)["ok"]
     wait_until(received)
     assert bench.client.call("/write-line", line=line)["ok"] is True
@@ -121,7 +121,7 @@ def test_only_one_job_at_a_time(bench):
 
 
 def test_job_waits_for_direct_commands(bench, received):
-    """dialects/spooler.md S9, B6: it is accepted, and never mixed with them."""
+    """docs/reference/spooler-api.md S9, B6: it is accepted, and never mixed with them."""
     assert bench.client.call("/write-line", line="G4 P0.2")["ok"]
     status = bench.client.call("/status")
     assert (status["busy"], status["num_pending_commands"]) == (True, 1)
@@ -214,7 +214,7 @@ def test_signals_end_with_the_job(bench, received):
 
 @pytest.mark.parametrize("field", ["lines", "content"])
 def test_init_lines_under_both_names(bench, received, field):
-    """dialects/spooler.md S3, S4."""
+    """docs/reference/spooler-api.md S3, S4."""
     assert bench.client.call("/set-init", **{field: ["set a.b 1", "", " set c 2 ", "; kept"]}) == {}
     kept = ["set a.b 1", "set c 2", "; kept"]
     assert bench.client.call("/get-init") == {"lines": kept, "content": kept}
@@ -440,7 +440,7 @@ def test_failed_job_is_called_as_the_machine_is_configured(two):
 
 
 def test_dead_core_is_seen_and_gets_nothing(two):
-    """dialects/spooler.md B21. The last test of this machine: it stays mute."""
+    """docs/reference/spooler-api.md B21. The last test of this machine: it stays mute."""
     server, edm, _mill = two
     client = server.client
     wait_until(lambda: client.call("/status")["device_alive"])

@@ -22,7 +22,7 @@ LOOSE = {"time", "now", "job_id", "time_added", "time_started", "time_ended", "k
 class Differs(NamedTuple):
     """An answer that deliberately differs from the original's.
 
-    ``S`` and ``B`` numbers are those of dialects/spooler.md, sections 3 and 4.
+    ``S`` and ``B`` numbers are those of the comparison in docs/reference/spooler-api.md.
     """
 
     status: int

@@ -291,7 +291,7 @@ KILLERS = [
 
 @pytest.mark.parametrize("times", KILLERS, ids=str)
 def test_queries_that_killed_the_original_have_one_sample(bench, times):
-    """dialects/spooler.md B1."""
+    """docs/reference/spooler-api.md B1."""
     answer = bench.client.call("/query-ts", query=["a", "queue.num"], **times)
     assert answer["times"] == pytest.approx([times["start"]])
     assert [len(series) for series in answer["values"].values()] == [1, 1]

@@ -69,15 +69,13 @@ async def _run_job(url: str, program: list[str]) -> str:
         while True:
             jobs = await asyncio.to_thread(_post, url, "/list-jobs", {})
             job = jobs["jobs"][-1]
-            progress.update(
-                task, description=job["status"], completed=job["num_executed"], total=job["num_commands"]
-            )
+            done = job.get("num_executed", 0)
+            progress.update(task, description=job["status"], completed=done, total=job["num_commands"])
             if "time_ended" in job:
                 break
             await asyncio.sleep(_LOOK_EVERY)
     click.echo(
-        f"toolpost: job {job['job_id']} {job['status']}: {job['num_executed']} commands "
-        f"in {time.monotonic() - began:.1f} s"
+        f"toolpost: job {job['job_id']} {job['status']}: {done} commands in {time.monotonic() - began:.1f} s"
     )
     return str(job["status"])
 

@@ -1,6 +1,7 @@
 """``toolpost serve``: the server."""
 
 import gc
+import os
 from pathlib import Path
 
 import click
@@ -21,6 +22,7 @@ from toolpost.errors import ConfigError
 @click.option("--verbose", is_flag=True, help="Log more.")
 def command(config: Path | None, data: Path, listen: tuple[str, ...], *, verbose: bool) -> None:
     """Drive the machines and answer requests until SIGTERM."""
+    os.umask(os.umask(0o027) | 0o027)
     set_up_logging(verbose=verbose)
     settings = read_config(config)
     addresses = _addresses(listen)

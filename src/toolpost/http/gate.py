@@ -17,7 +17,6 @@ from typing import Final
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from toolpost.config import ServerConfig
-from toolpost.errors import ConfigError
 from toolpost.http.answer import CORS_METHODS, send_answer, send_text
 
 _LOCAL_NAMES: Final = frozenset({"localhost", "127.0.0.1", "[::1]"})
@@ -51,7 +50,7 @@ class Gate:
         self._app = app
         self._local = local
         self._key_owner = key_owner
-        self._networks = parse_networks(config)
+        self._networks = [ipaddress.ip_network(text) for text in config.open_networks]
         own = socket.gethostname().lower()
         self._hosts = _LOCAL_NAMES | {own, f"{own}.local"} | {host.lower() for host in config.hosts}
         self._origins = frozenset(origin.lower().rstrip("/") for origin in config.origins)
@@ -163,21 +162,6 @@ class FailureLimit:
         """Whether an address has sent too many."""
         since, count = self._failures.get(peer, (0.0, 0))
         return count > _FAILURES and self._clock() - since <= _FAILURE_WINDOW
-
-
-def parse_networks(
-    config: ServerConfig,
-) -> list[ipaddress.IPv4Network | ipaddress.IPv6Network]:
-    """Return the networks of ``server.open_networks``; ConfigError if one is none."""
-    networks = []
-    for text in config.open_networks:
-        try:
-            networks.append(ipaddress.ip_network(text))
-        except ValueError as error:
-            raise ConfigError(
-                f'server.open_networks: {error}; write a network such as "192.168.1.0/24"'
-            ) from None
-    return networks
 
 
 def _read_headers(

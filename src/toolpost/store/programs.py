@@ -72,6 +72,11 @@ class ProgramStore:
         except OSError as error:
             raise StorageError(f"program {sha256[:12]} cannot be read: {error.strerror}") from None
 
+    @property
+    def size(self) -> int:
+        """Bytes that all programs take together."""
+        return self._total
+
     def trim(self, in_use: set[str], max_bytes: int) -> None:
         """Delete the oldest programs that no job needs, if all together are larger than `max_bytes`."""
         if self._total <= max_bytes:

@@ -1,6 +1,11 @@
 """What telemetry may take of the machine it runs on."""
 
+from typing import Annotated
+
 import msgspec
+from msgspec import Meta
+
+_Count = Annotated[int, Meta(ge=1)]
 
 
 class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -18,12 +23,12 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         pending_reports: reports that may wait for the store's thread; more are dropped.
     """
 
-    max_bytes: int = 1 << 30
-    max_age_s: float = 90 * 86_400.0
-    tags_per_machine: int = 256
-    shapes_per_tag: int = 64
-    keys_per_report: int = 256
-    name_chars: int = 128
-    text_chars: int = 256
-    ring_reports: int = 256
-    pending_reports: int = 65_536
+    max_bytes: _Count = 1 << 30
+    max_age_s: Annotated[float, Meta(gt=0)] = 90 * 86_400.0
+    tags_per_machine: _Count = 256
+    shapes_per_tag: _Count = 64
+    keys_per_report: _Count = 256
+    name_chars: _Count = 128
+    text_chars: _Count = 256
+    ring_reports: _Count = 256
+    pending_reports: _Count = 65_536

@@ -14,6 +14,7 @@ MAX_COUNT = 10_000
 MAX_KEYS = 1_000
 MAX_VALUES = 250_000
 MAX_LINE = 100
+MAX_INIT_LINES = 100_000
 MIN_INTERVAL = 0.02
 MAX_INTERVAL = 86_400.0
 MAX_SIGNALS = 64
@@ -94,6 +95,8 @@ class SpoolerApi:
         lines = request.lines if request.lines is not None else request.content
         if lines is None:
             raise InvalidRequestError("lines: must be given")
+        if len(lines) > MAX_INIT_LINES:
+            raise InvalidRequestError(f"{name}: must be at most {MAX_INIT_LINES} lines")
         try:
             await self._shop.set_init_lines(self._machine, lines)
         except InvalidLineError as error:
@@ -170,7 +173,7 @@ class SpoolerApi:
             time_ended=None if job.ended_us is None else seconds(job.ended_us),
             reason=job.reason.value,
             detail=job.detail or None,
-            num_commands=progress.total,
-            num_sent=progress.sent,
-            num_executed=progress.executed,
+            num_commands=job.commands,
+            num_sent=None if progress is None else progress.sent,
+            num_executed=None if progress is None else progress.executed,
         )

@@ -54,7 +54,7 @@ class SparkDriver:
         self._listener = listener
         self._options = options
         self._loop = asyncio.get_running_loop()
-        self._sender = Sender(comm, options, listener.changed)
+        self._sender = Sender(comm, options, listener.changed, self._source_broken)
         self._link: Link | None = None
         self._lost = asyncio.Event()
         self._answered = asyncio.Event()
@@ -198,6 +198,7 @@ class SparkDriver:
         self._sender.close()
         if self._polls is not None:
             self._polls.cancel()
+        self._link_gone = True
         if self._link is not None:
             self._link.close()
             self._link = None
@@ -313,6 +314,11 @@ class SparkDriver:
         log.error("%s: the core's queue was full and a command is lost", self._name)
         if self._sender.running:
             self._fail_and_stop(Reason.QUEUE_FULL, "the core's queue was full and a command is lost")
+
+    def _source_broken(self, detail: str) -> None:
+        if self._sender.running:
+            log.error("%s: %s", self._name, detail)
+            self._fail_and_stop(Reason.PROGRAM_MISSING, detail)
 
     def _fail_and_stop(self, reason: Reason, detail: str) -> None:
         self._end_work(Ending(Outcome.FAILED, reason, detail))

@@ -1,6 +1,11 @@
 """Options of a machine with a Spark core."""
 
+from typing import Annotated
+
 import msgspec
+from msgspec import Meta
+
+_Limit = Annotated[float, Meta(gt=0, le=3600)]
 
 
 class SparkOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -13,7 +18,7 @@ class SparkOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         stop_on_connect: send ``!`` whenever the link opens, so that nothing goes on from before.
     """
 
-    hold_off: float = 0.5
-    answer_timeout: float = 1.0
-    silence_limit: float = 5.0
+    hold_off: Annotated[float, Meta(ge=0, le=60)] = 0.5
+    answer_timeout: _Limit = 1.0
+    silence_limit: _Limit = 5.0
     stop_on_connect: bool = False

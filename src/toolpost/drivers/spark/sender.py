@@ -14,12 +14,13 @@ from toolpost.drivers.spark import lines
 from toolpost.drivers.spark.flow import Flow
 from toolpost.drivers.spark.options import SparkOptions
 from toolpost.drivers.spark.pacing import HEARTBEAT, drain_delay, refill_delay
+from toolpost.errors import StorageError
 from toolpost.links.base import Link
 
 _ASK = b"?queue\n"
 _STOP = b"!\n"
 _IDLE_ANSWERS = 2
-_MAX_WAITING = 10_000
+_MAX_WAITING = 100_000
 _MAX_UNWRITTEN = 65_536
 _PATIENCE_MOST = 10.0
 
@@ -31,6 +32,7 @@ class Sender:
         comm: logs what is sent.
         options: see `SparkOptions`.
         free: called when the hold-off after a stop is over.
+        broken: called, with words for a person, when the source cannot be read.
 
     Attributes:
         taken: commands of the present run that have been sent; 0 between two runs.
@@ -38,13 +40,20 @@ class Sender:
         stop_owed: whether a stop has to be sent as soon as there is a link.
     """
 
-    def __init__(self, comm: CommLog, options: SparkOptions, free: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        comm: CommLog,
+        options: SparkOptions,
+        free: Callable[[], None],
+        broken: Callable[[str], None],
+    ) -> None:
         self.taken = 0
         self.asked_at = 0.0
         self.stop_owed = options.stop_on_connect
         self._comm = comm
         self._options = options
         self._free = free
+        self._broken = broken
         self._loop = asyncio.get_running_loop()
         self._link: Link | None = None
         self._flow = Flow()
@@ -114,7 +123,8 @@ class Sender:
             self._ask()
 
     def close(self) -> None:
-        """Cancel the timers."""
+        """Send nothing more and cancel the timers."""
+        self._link = None
         self._end_hold()
         if self._ask_timer is not None:
             self._ask_timer.cancel()
@@ -192,9 +202,7 @@ class Sender:
         while self._direct and len(batch) < credit:
             batch.append(self._direct.popleft())
         if self._source is not None:
-            commands = self._source.take(credit - len(batch))
-            self.taken += len(commands)
-            batch += commands
+            batch += self._take(self._source, credit - len(batch))
         if not batch:
             return
         self._idle_answers = 0
@@ -209,6 +217,15 @@ class Sender:
             flow.sent += len(batch) - first
             batch.insert(first, _ASK[:-1])
         self._write(b"\n".join(batch) + b"\n")
+
+    def _take(self, source: LineSource, most: int) -> list[bytes]:
+        try:
+            commands = source.take(most)
+        except StorageError as error:
+            self._loop.call_soon(self._broken, str(error))
+            return []
+        self.taken += len(commands)
+        return commands
 
     # Questions and answers.
 
