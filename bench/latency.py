@@ -6,7 +6,7 @@ import time
 from bench.result import Result, at_most, percentile
 from bench.rig import Rig, rig, wall
 from bench.stream import moves
-from toolpost.sim.spark import SparkOptions
+from toolpost.sim.options import SparkOptions
 
 _FEW_COMMANDS = 10
 
@@ -62,7 +62,7 @@ async def cancel_latency(cancels: int) -> list[Result]:
     leaked = 0
     async with rig(SparkOptions(command_time=0.0, hold_off=0.0), hold_off=0.01) as bench:
         for _ in range(cancels):
-            await bench.run_job(moves(60_000))
+            await bench.run_job(moves(20_000))
             await _streaming(bench)
             asked = time.monotonic()
             await bench.client.post("/cancel", {})

@@ -10,7 +10,7 @@ from bench.result import Result, at_least, at_most
 from bench.rig import rig, start_server, stop_server
 from bench.stream import moves
 from toolpost.core.report import Report
-from toolpost.sim.spark import SparkOptions
+from toolpost.sim.options import SparkOptions
 from toolpost.telemetry import Telemetry
 
 _STATUS = (

@@ -12,8 +12,9 @@ from typing import Any
 
 import msgspec
 
+from toolpost.sim.options import SparkOptions
 from toolpost.sim.ports import PtyPort
-from toolpost.sim.spark import SparkCore, SparkOptions
+from toolpost.sim.spark import SparkCore
 
 _CONFIG = """
 [server]

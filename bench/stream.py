@@ -7,7 +7,7 @@ import tty
 
 from bench.result import Result, at_least
 from bench.rig import Rig, rig
-from toolpost.sim.spark import SparkOptions
+from toolpost.sim.options import SparkOptions
 
 
 def moves(count: int) -> list[str]:

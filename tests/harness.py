@@ -22,8 +22,9 @@ from typing import Any, NamedTuple, Self, TypeVar
 from urllib.parse import urlsplit
 
 from toolpost.sim.faults import Fault
+from toolpost.sim.options import SparkOptions
 from toolpost.sim.ports import PtyPort
-from toolpost.sim.spark import SparkCore, SparkOptions
+from toolpost.sim.spark import SparkCore
 
 T = TypeVar("T")
 Body = bytes | str | dict[str, Any] | list[Any] | None

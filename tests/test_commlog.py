@@ -13,7 +13,7 @@ import pytest
 from tests.harness import Port, Server, spark_config, wait_until
 from toolpost import commlog
 from toolpost.commlog import CommLog, CommLogLimits
-from toolpost.sim.spark import SparkOptions
+from toolpost.sim.options import SparkOptions
 
 LINE = re.compile(rb"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d{3}\+00:00 (up|down|note) [\x20-\x7e]*")
 

@@ -15,7 +15,7 @@ from toolpost.commlog import CommLogLimits
 from toolpost.drivers.spark.options import SparkOptions
 from toolpost.errors import ConfigError
 from toolpost.sim.faults import Fault
-from toolpost.sim.spark import SparkOptions as SimulatedSparkOptions
+from toolpost.sim.options import SimulatedSparkOptions
 from toolpost.telemetry.limits import Limits as TelemetryLimits
 
 DRIVERS: Final = ("spark",)
@@ -85,18 +85,6 @@ class SpoolerConfig(_Table, frozen=True, kw_only=True):
     failed: Literal["FAILED", "CANCELED"] = "FAILED"
 
 
-class SimulatedSparkConfig(SimulatedSparkOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The simulated core of a machine whose link is ``sim``.
-
-    Attributes:
-        baud: speed of its wire, bits per second; without it, no limit.
-        faults: what shall go wrong, as ``toolpost sim spark --fault`` takes it.
-    """
-
-    baud: Positive | None = None
-    faults: tuple[str, ...] = ()
-
-
 class MachineConfig(_Table, frozen=True, kw_only=True):
     """One machine.
 
@@ -118,7 +106,7 @@ class MachineConfig(_Table, frozen=True, kw_only=True):
     history: HistoryConfig = HistoryConfig()
     spooler: SpoolerConfig = SpoolerConfig()
     spark: SparkOptions = SparkOptions()
-    sim: SimulatedSparkConfig = SimulatedSparkConfig()
+    sim: SimulatedSparkOptions = SimulatedSparkOptions()
     log: CommLogLimits = CommLogLimits()
 
 

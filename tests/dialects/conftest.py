@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import pytest
 from tests.harness import Client, Port, Server, spark_config, wait_until
 
-from toolpost.sim.spark import SparkOptions
+from toolpost.sim.options import SparkOptions
 
 ENDED = {"COMPLETED", "CANCELED", "FAILED"}
 

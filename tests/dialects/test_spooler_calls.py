@@ -6,7 +6,7 @@ import time
 import pytest
 from tests.harness import Port, Server, wait_until
 
-from toolpost.sim.spark import SparkOptions
+from toolpost.sim.options import SparkOptions
 
 # /write-line
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import pytest
 from tests.harness import Port, Server, spark_config, wait_until
 
-from toolpost.sim.spark import SparkOptions
+from toolpost.sim.options import SparkOptions
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "spooler.jsonl"
 RECORDS = [

@@ -28,6 +28,7 @@ from toolpost.drivers.spark import driver, flow, framing, lines, pacing, pstate,
 from toolpost.http import body, gate, server
 from toolpost.http.body import BodyReader
 from toolpost.links import net
+from toolpost.sim import execution as sim_execution
 from toolpost.sim import faults
 from toolpost.sim import lines as sim_lines
 from toolpost.sim import spark as sim_spark
@@ -350,7 +351,7 @@ LIMITS: list[tuple[str, float, str]] = [
     ("time until it survives a power cut", store.SYNC_S, "s"),
     ("a line to it", sim_lines.MAX_LINE, "bytes"),
     ("settings", sim_spark.MAX_SETTINGS, ""),
-    ("dwell", sim_spark.MAX_DWELL, "s"),
+    ("dwell", sim_execution.MAX_DWELL, "s"),
     ("garbage of one fault", faults.MAX_GARBAGE, "bytes"),
 ]
 

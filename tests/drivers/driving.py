@@ -12,8 +12,8 @@ from toolpost.drivers.spark.options import SparkOptions
 from toolpost.links.base import Link, LinkListener
 from toolpost.links.net import socket_link
 from toolpost.sim.faults import Fault
+from toolpost.sim.options import SparkOptions as CoreOptions
 from toolpost.sim.ports import SimulatedSpark
-from toolpost.sim.spark import SparkOptions as CoreOptions
 
 QUICK = SparkOptions(hold_off=0.05, answer_timeout=0.3, silence_limit=0.8)
 TIMEOUT = 20.0

@@ -9,7 +9,7 @@ from toolpost.core.job import Reason
 from toolpost.core.machine import LinkState
 from toolpost.drivers.base import Outcome
 from toolpost.drivers.spark.options import SparkOptions
-from toolpost.sim.spark import SparkOptions as CoreOptions
+from toolpost.sim.options import SparkOptions as CoreOptions
 
 SLOWISH = CoreOptions(command_time=0.005, hold_off=0.05)
 

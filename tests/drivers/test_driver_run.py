@@ -11,7 +11,7 @@ from tests.drivers.driving import QUICK, driving, moves
 from toolpost.core.machine import Execution, LinkState
 from toolpost.drivers.base import Outcome
 from toolpost.drivers.spark.flow import FILL
-from toolpost.sim.spark import SparkOptions as CoreOptions
+from toolpost.sim.options import SparkOptions as CoreOptions
 
 
 @settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

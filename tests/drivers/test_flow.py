@@ -192,7 +192,7 @@ class Wire(RuleBasedStateMachine):
 
 
 TestWire = Wire.TestCase
-TestWire.settings = settings(max_examples=300, stateful_step_count=50, deadline=None)
+TestWire.settings = settings(max_examples=200, stateful_step_count=50, deadline=None)
 
 
 def opened(capacity=64, num=0):

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.harness import Port, Server, spark_config, wait_until
-from toolpost.sim.spark import SparkOptions
+from toolpost.sim.options import SparkOptions
 
 
 @pytest.fixture

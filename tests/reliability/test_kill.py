@@ -10,7 +10,7 @@ from collections import Counter
 import pytest
 
 from tests.harness import Client, Port, Server, spark_config, wait_until
-from toolpost.sim.spark import SparkOptions
+from toolpost.sim.options import SparkOptions
 
 QUICK_KILLS = 60
 SOAK_KILLS = 500

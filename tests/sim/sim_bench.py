@@ -5,7 +5,8 @@ import itertools
 import re
 
 from toolpost.sim.faults import Fault
-from toolpost.sim.spark import SparkCore, SparkOptions
+from toolpost.sim.options import SparkOptions
+from toolpost.sim.spark import SparkCore
 
 
 class Timer:

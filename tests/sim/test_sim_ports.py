@@ -13,8 +13,8 @@ import pytest
 
 from toolpost.errors import StartError
 from toolpost.sim.faults import Fault
+from toolpost.sim.options import SparkOptions
 from toolpost.sim.ports import PtyPort, SimulatedSpark
-from toolpost.sim.spark import SparkOptions
 from toolpost.sim.stream import OUTPUT_LIMIT
 
 INSTANT = SparkOptions(command_time=0)

@@ -12,7 +12,7 @@ SCRIPT = """
 import asyncio, sys
 from pathlib import Path
 from toolpost.sim.run import run
-from toolpost.sim.spark import SparkOptions
+from toolpost.sim.options import SparkOptions
 link = Path(sys.argv[1]) if len(sys.argv) > 1 else None
 asyncio.run(run(SparkOptions(), link=link, baud=None, faults=[]))
 """

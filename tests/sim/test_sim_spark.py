@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sim_bench import Bench, parse
 
-from toolpost.sim.spark import SparkOptions
+from toolpost.sim.options import SparkOptions
 
 
 def test_queue_counts_waiting_and_running():

@@ -10,8 +10,9 @@ import click
 import msgspec
 
 from toolpost.cli.common import fail, run
-from toolpost.config import Address, Config, MachineConfig, SimulatedSparkConfig
+from toolpost.config import Address, Config, MachineConfig
 from toolpost.errors import ToolpostError
+from toolpost.sim.options import SimulatedSparkOptions
 
 _LOOK_EVERY = 0.1
 _COMMAND_TIME = 0.001
@@ -31,7 +32,7 @@ async def _demo(size: int) -> None:
     from toolpost.app import App
     from toolpost.sim.sample import sample_program
 
-    simulated = SimulatedSparkConfig(command_time=_COMMAND_TIME)
+    simulated = SimulatedSparkOptions(command_time=_COMMAND_TIME)
     config = Config(machines={"edm": MachineConfig(driver="spark", link="sim", sim=simulated)})
     with tempfile.TemporaryDirectory(prefix="toolpost-demo-") as data:
         app = App(config, Path(data), [Address("127.0.0.1", 0)])

@@ -1,13 +1,14 @@
 """``toolpost sim``: a simulated machine by itself."""
 
 from pathlib import Path
+from typing import Literal
 
 import click
 
 from toolpost.cli.common import fail, run
 from toolpost.sim.faults import Fault
+from toolpost.sim.options import SparkOptions
 from toolpost.sim.run import run as run_spark
-from toolpost.sim.spark import SparkOptions
 
 
 @click.group("sim")
@@ -23,6 +24,13 @@ def command() -> None:
 @click.option("--answer-delay", default=0.0, show_default=True, help="Seconds until an answer is sent.")
 @click.option(
     "--hold-off", default=0.5, show_default=True, help="Seconds after ! in which commands are ignored."
+)
+@click.option(
+    "--boot-message",
+    type=click.Choice(["sys", "init", "none"]),
+    default="sys",
+    show_default=True,
+    help="What it says when it boots: as newer firmware, as older, or nothing.",
 )
 @click.option("--baud", type=click.IntRange(min=50), help="Speed of the wire; without it, no limit.")
 @click.option(
@@ -40,6 +48,7 @@ def spark(
     realtime: bool,
     answer_delay: float,
     hold_off: float,
+    boot_message: Literal["sys", "init", "none"],
     baud: int | None,
     faults: tuple[str, ...],
 ) -> None:
@@ -51,6 +60,7 @@ def spark(
             realtime_moves=realtime,
             answer_delay=answer_delay,
             hold_off=hold_off,
+            boot_message=boot_message,
         )
         planned = [Fault.parse(text) for text in faults]
     except ValueError as error:

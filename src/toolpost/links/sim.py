@@ -2,15 +2,15 @@
 
 import asyncio
 
-from toolpost.config import SimulatedSparkConfig
 from toolpost.errors import LinkError
 from toolpost.links.base import Link, LinkListener, Opener
 from toolpost.links.net import socket_link
 from toolpost.sim.faults import Fault
+from toolpost.sim.options import SimulatedSparkOptions
 from toolpost.sim.ports import SimulatedSpark
 
 
-def simulated_spark_opener(config: SimulatedSparkConfig) -> Opener:
+def simulated_spark_opener(options: SimulatedSparkOptions) -> Opener:
     """Return an opener of a simulated Spark core, which lives on when the link is lost."""
     core: SimulatedSpark | None = None
 
@@ -18,7 +18,10 @@ def simulated_spark_opener(config: SimulatedSparkConfig) -> Opener:
         nonlocal core
         if core is None:
             core = SimulatedSpark(
-                asyncio.get_running_loop(), config, baud=config.baud, faults=map(Fault.parse, config.faults)
+                asyncio.get_running_loop(),
+                options,
+                baud=options.baud,
+                faults=map(Fault.parse, options.faults),
             )
         try:
             sock = core.connect()

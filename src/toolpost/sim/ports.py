@@ -13,7 +13,8 @@ from pathlib import Path
 
 from toolpost.errors import StartError
 from toolpost.sim.faults import Fault
-from toolpost.sim.spark import SparkCore, SparkOptions
+from toolpost.sim.options import SparkOptions
+from toolpost.sim.spark import SparkCore
 from toolpost.sim.stream import Stream
 
 HOST_POLL = 0.02
@@ -85,7 +86,7 @@ class PtyPort:
             self._plug()
         except OSError as error:
             self._withdraw()
-            raise StartError(f"cannot make the simulated port: {error}") from error
+            raise StartError(self._explain(error)) from error
         self.core.boot()
         for fault in self._faults:
             self.core.inject(fault)
@@ -105,6 +106,13 @@ class PtyPort:
         if self._link:
             _make_link(self._link, self._device)
         self._listen()
+
+    def _explain(self, error: OSError) -> str:
+        if self._link is None or error.filename is None:
+            return f"cannot make the simulated port: {error.strerror or error}"
+        if isinstance(error, FileExistsError):
+            return f"{self._link}: is taken by something that is no link to a pty; name another path"
+        return f"{self._link}: cannot be made: {error.strerror}"
 
     def _withdraw(self) -> None:
         if self._timer is not None:

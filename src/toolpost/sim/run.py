@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TextIO
 
 from toolpost.sim.faults import Fault
+from toolpost.sim.options import SparkOptions
 from toolpost.sim.ports import PtyPort
-from toolpost.sim.spark import SparkOptions
 
 _STDIN = 0
 _MAX_LINE = 4096

@@ -6,78 +6,26 @@ of the Spark serial protocol (lines down, flow control, cancel, boot and fault).
 
 import asyncio
 import math
-import re
 import time
-from collections import deque
 from collections.abc import Callable
-from typing import Literal
 
-import msgspec
-
-from toolpost.sim import replies
-from toolpost.sim.delay import DelayLine
+from toolpost.sim import commands, replies
+from toolpost.sim.answers import Answers
+from toolpost.sim.execution import Execution
 from toolpost.sim.faults import Fault, FaultSchedule
 from toolpost.sim.lines import LF, MAX_LINE, LineReader
-from toolpost.sim.motion import AXES, RAPID_FEED, RUN, Motion
+from toolpost.sim.motion import AXES, RUN
+from toolpost.sim.options import SparkOptions
+from toolpost.sim.timers import Timers
 
 MAX_SETTINGS = 512
 """Settings that the core can hold."""
-
-MAX_DWELL = 86_400.0
-"""The longest dwell that ``G4`` obeys, seconds."""
 
 DEFAULT_SLOW = 0.5
 DEFAULT_UNPLUGGED = 1.0
 DEFAULT_NOISE = 64
 
-_NUMBER = rb"[-+]?(?:[0-9]++(?:\.[0-9]*+)?+|\.[0-9]++)"  # possessive, or a bad line would take for ever
-_COMMAND = re.compile(rb"[GM][0-9]{1,4}+(?:\.[0-9])?+(?: *[A-Z]%b)*+ *+" % _NUMBER)
-_HOME = re.compile(rb"G28(?: *[XYZC])* *")
-_SET = re.compile(rb"f?set +([A-Za-z0-9_]+(?:\.[A-Za-z0-9_]+)*) +([-+]?[0-9]{1,9}(?:\.[0-9]{0,9})?) *")
-_DWELL = re.compile(rb"G0?4 ?P([0-9]+\.?[0-9]*|\.[0-9]+)")
-_LINEAR = re.compile(rb"G0?([01])(?![0-9.])")
-_SHORTEST_WAIT = 0.001  # below it a loop's timers round to a busy loop
-_EDM_GAP = 0.003  # other answers may come between the two parts of a report for this long
 _STILL_CUTTING = 0.5  # with commands that take no time, a cut goes on showing for this long
-
-
-class SparkOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a simulated Spark core is like.
-
-    Attributes:
-        capacity: commands that the queue holds, as ``?queue`` reports; one more is lost.
-        command_time: seconds that each G or M command takes; 0 executes at once. ``set``,
-            ``get`` and ``stat`` take no time, and ``G4 P<seconds>`` takes its own unless no
-            command takes any.
-        realtime_moves: G0 and G1 take the time that their distance and feed give, and
-            ``command_time`` is for all others.
-        answer_delay: seconds until the answer to a signal, to ``get`` or ``stat`` is sent.
-        hold_off: seconds after ``!`` in which all but ``?`` signals is ignored; 0 for the older
-            firmware, which has no such time.
-        boot_message: ``sys`` (newer firmware), ``init`` (older) or ``none``.
-        boot_time: seconds that a boot takes; what arrives meanwhile is discarded.
-    """
-
-    capacity: int = 64
-    command_time: float = 0.05
-    realtime_moves: bool = False
-    answer_delay: float = 0.0
-    hold_off: float = 0.5
-    boot_message: Literal["sys", "init", "none"] = "sys"
-    boot_time: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Refuse numbers that mean nothing.
-
-        Raises:
-            ValueError: a time is negative or not finite, or the capacity is below 1.
-        """
-        if self.capacity < 1:
-            raise ValueError(f"capacity must be at least 1, not {self.capacity}")
-        for name in ("command_time", "answer_delay", "hold_off", "boot_time"):
-            value = getattr(self, name)
-            if not math.isfinite(value) or value < 0:
-                raise ValueError(f"{name} must be 0 or more seconds, not {value}")
 
 
 class SparkCore:
@@ -120,7 +68,6 @@ class SparkCore:
     ) -> None:
         self._clock = clock
         self._send = send
-        self._loop = loop
         self._options = options
         self._trace = trace
         self.received = 0
@@ -138,29 +85,22 @@ class SparkCore:
         self.unplug: Callable[[float], None] = lambda _seconds: None
 
         self._counting_after_bang = False
-        self._timed = options.command_time > 0 or options.realtime_moves
+        self._timed = options.timed
         self._lines = LineReader()
         self._edits = 0
-        self._motion = Motion(self.settings)
         self._faults = FaultSchedule(loop, self._apply, clock)
-        self._answers = DelayLine(loop, self._up, clock)
-        self._delay = options.answer_delay
-        self._waiting: deque[bytes] = deque()
-        self._running: bytes | None = None
-        self._due = 0.0
-        self._wake_timer: asyncio.TimerHandle | None = None
-        self._timers: dict[str, asyncio.TimerHandle] = {}
-        self._edm_rest = b""
-        self._edm_asked = 0
+        self._timers = Timers(loop)
+        self._answers = Answers(self._up, loop, self._timers, clock, options.answer_delay)
+        self._execution = Execution(
+            loop, clock, options, self.settings, self._carry_out, self._count_for_faults
+        )
         self._cut_at = -math.inf
         self._booted_at = self._clock()
         self._booting = False
         self._failed = False
-        self._stalled_at: float | None = None
         self._muted = False
         self._deaf_until = 0.0
         self._refuse_next = 0
-        self._drop_answers = 0
         self._garbled = 0
         self._closed = False
         self._straight = False
@@ -171,12 +111,12 @@ class SparkCore:
     @property
     def position(self) -> dict[str, float]:
         """The machine position now: mm, and degrees for c."""
-        return dict(zip(AXES, self._motion.position(self._clock()), strict=True))
+        return dict(zip(AXES, self._execution.motion.position(self._clock()), strict=True))
 
     @property
     def queue_length(self) -> int:
         """Commands that wait or run."""
-        return len(self._waiting) + (self._running is not None)
+        return self._execution.length
 
     @property
     def overlong(self) -> int:
@@ -199,9 +139,7 @@ class SparkCore:
         """Stop: no timer runs on, nothing more is sent or taken."""
         self._reset()
         self._faults.close()
-        for timer in self._timers.values():
-            timer.cancel()
-        self._timers.clear()
+        self._timers.close()
         self._closed = True
 
     def inject(self, fault: Fault) -> None:
@@ -216,7 +154,7 @@ class SparkCore:
         if self._options.boot_time > 0:
             self._booting = True
             self._choose_path()
-            self._after("boot", self._options.boot_time, lambda: self._end_boot(message))
+            self._timers.start("boot", self._options.boot_time, lambda: self._end_boot(message))
         else:
             self._end_boot(message)
 
@@ -230,17 +168,13 @@ class SparkCore:
 
     def _reset(self) -> None:
         """Make the state fresh. A mute or slow line and faults not yet due stay as they are."""
-        self._drop_commands()
+        self.canceled += self._execution.reset()
         self._answers.clear()
-        for name in ("boot", "edm", "stall"):
-            self._cancel_timer(name)
+        self._timers.cancel("boot", "stall")
         self._lines.reset()
         self.settings.clear()
         self.settings.update(replies.default_settings())
-        self._motion = Motion(self.settings)
-        self._edm_rest = b""
         self._booting = self._failed = False
-        self._stalled_at = None
         self._deaf_until = 0.0
         self._choose_path()
 
@@ -251,8 +185,8 @@ class SparkCore:
         if self._closed:
             return
         now = self._clock()
-        if self._running is not None:
-            self._advance(now)
+        if self._execution.running is not None:
+            self._execution.advance(now)
         if self._deaf_until and now >= self._deaf_until:
             self._deaf_until = 0.0
             self._choose_path()
@@ -290,7 +224,7 @@ class SparkCore:
             self.first_command_at = now
         if self._counting_after_bang:
             self.commands_after_bang += count
-        self._motion.run(lines, start, stop)
+        self._execution.motion.run(lines, start, stop)
 
     def _choose_path(self) -> None:
         """Decide whether plain moves may be executed without a look at each."""
@@ -299,7 +233,7 @@ class SparkCore:
             or self._trace
             or self._booting
             or self._failed
-            or self._stalled_at is not None
+            or self._execution.stalled
             or self._deaf_until
             or self._refuse_next
             or self._faults.counting
@@ -308,7 +242,7 @@ class SparkCore:
     def _discard(self, lines: bytes) -> None:
         for line in lines.split(LF)[:-1]:
             self._note("received", line)
-            if _is_command(line):
+            if commands.is_command(line):
                 self._count_arrival(self._clock())
                 self.ignored += 1
             self._note("ignored", line)
@@ -351,43 +285,18 @@ class SparkCore:
 
     def _signal(self, line: bytes, now: float) -> None:
         if line == b"?queue":
-            if self._drop_answers:
-                self._drop_answers -= 1
-            else:
-                self._answer(replies.queue(self._options.capacity, self.queue_length))
+            self._answers.queue(self._options.capacity, self._execution.length)
         elif line == b"?pos":
-            self._answer(replies.position(self._motion, now))
+            self._answers.position(self._execution.motion, now)
         elif line == b"?edm":
-            self._answer_edm(now)
+            self._answers.discharge(now, cutting=self._cutting(now))
         else:
             self._note("ignored", line)
 
-    def _answer(self, data: bytes) -> None:
-        self._answers.push(data, self._delay)
-        if self._edm_rest:
-            self._end_edm()
-
-    def _answer_edm(self, now: float) -> None:
-        """Answer ``?edm``; every other time another answer may come between its lines."""
-        if self._edm_rest:
-            self._end_edm()
-        first, rest = replies.discharge(self._cutting(now), now)
-        self._edm_asked += 1
-        if self._edm_asked % 2:
-            self._answers.push(first + rest, self._delay)
-            return
-        self._answers.push(first, self._delay)
-        self._edm_rest = rest
-        self._after("edm", _EDM_GAP, self._end_edm)
-
-    def _end_edm(self) -> None:
-        self._cancel_timer("edm")
-        rest, self._edm_rest = self._edm_rest, b""
-        self._answers.push(rest, self._delay)
-
     def _cutting(self, now: float) -> bool:
         if self._timed:
-            return self._running is not None and self._running.startswith(b"G1")
+            running = self._execution.running
+            return running is not None and running.startswith(b"G1")
         return now - self._cut_at < _STILL_CUTTING
 
     def _bang(self, now: float) -> None:
@@ -398,10 +307,9 @@ class SparkCore:
         self.last_bang_at = now
         self.commands_after_bang = 0
         self._counting_after_bang = True
-        self._motion.halt(now)
-        self._drop_commands()
-        self._edm_rest = b""
-        self._cancel_timer("edm")
+        self._execution.motion.halt(now)
+        self.canceled += self._execution.drop()
+        self._answers.cut_short()
         if self._options.hold_off > 0:
             self._deaf_until = now + self._options.hold_off
         self._choose_path()
@@ -413,88 +321,51 @@ class SparkCore:
             self.ignored += 1
             self._note("ignored", line)
             return
-        problem = _problem(line)
+        problem = commands.problem(line)
         if problem:
             self.rejected += 1
             self._note("ignored", line)
             self._up(replies.error(problem, line))
             return
-        if self._refuse_next or self.queue_length >= self._options.capacity:
+        if self._refuse_next or self._execution.length >= self._options.capacity:
             self._refuse_next = max(0, self._refuse_next - 1)
             self.lost += 1
             self._note("lost", line)
             self._choose_path()
             self._up(replies.error("queue full", line))
             return
-        self._waiting.append(line)
-        if self._running is None and self._stalled_at is None:
-            self._due = now
-            self._start_next()
-            self._advance(now)
+        self._execution.add(line, now)
 
-    def _start_next(self) -> None:
-        """Start the next command where the one before it ended, so that no time is lost."""
-        if not self._waiting:
-            self._running = None
-            return
-        line = self._waiting.popleft()
-        self._running = line
-        began = self._due
-        distance = self._motion.begin(line, began)
-        seconds = self._duration(line, distance)
-        self._motion.last(seconds)
-        self._due = began + seconds
-
-    def _duration(self, line: bytes, distance: float) -> float:
-        """Return how long a command takes, seconds."""
-        if not self._timed or line[:1] not in b"GM":
-            return 0.0
-        if dwell := _DWELL.match(line):
-            return min(float(dwell[1]), MAX_DWELL)
-        if self._options.realtime_moves and (move := _LINEAR.match(line)):
-            return distance * 60.0 / (RAPID_FEED if move[1] == b"0" else self._motion.feed)
-        return self._options.command_time
-
-    def _advance(self, now: float) -> None:
-        """Execute everything whose time is over, then wait for the next."""
-        while self._running is not None and self._due <= now and self._stalled_at is None:
-            self._finish(self._running)
-        if self._running is not None and self._wake_timer is None and self._stalled_at is None:
-            delay = max(_SHORTEST_WAIT, self._due - now)
-            self._wake_timer = self._loop.call_later(delay, self._wake)
-
-    def _wake(self) -> None:
-        self._wake_timer = None
-        self._advance(self._clock())
-
-    def _finish(self, line: bytes) -> None:
+    def _carry_out(self, line: bytes, ended: float) -> None:
+        """Do what a command does at its end."""
         self.executed += 1
-        self.last_executed_at = self._due
+        self.last_executed_at = ended
         if line[:2] == b"G1":
-            self._cut_at = self._due
+            self._cut_at = ended
         self._note("executed", line)
         if line[:4] == b"set ":
             self._set(line)
         elif line[:3] == b"get":
-            self._answer(replies.settings_report(self.settings))
+            self._answers.give(replies.settings_report(self.settings))
         elif line[:4] == b"stat":
             seconds = self._clock() - self._booted_at
-            self._answer(replies.statistics(self.executed, seconds))
-        self._start_next()
+            self._answers.give(replies.statistics(self.executed, seconds))
+
+    def _count_for_faults(self) -> None:
         if self._faults.counting:
             self._faults.on_executed(self.executed)
             self._choose_path()
 
     def _set(self, line: bytes) -> bool:
         """Carry out a ``set`` or ``fset``; answer with an error if there is no room."""
-        match = _SET.fullmatch(line)
-        if match is None:
+        found = commands.assignment(line)
+        if found is None:
             return False
-        key = match[1].decode()
+        key, value = found
         if key not in self.settings and len(self.settings) >= MAX_SETTINGS:
             self._up(replies.error("too many settings", line))
-            return True
-        self.settings[key] = float(match[2])
+        else:
+            self.settings[key] = value
         return True
 
     def _set_now(self, line: bytes) -> None:
@@ -503,14 +374,6 @@ class SparkCore:
             self._note("ignored", line)
         elif not self._set(line):
             self._up(replies.error("invalid set", line))
-
-    def _drop_commands(self) -> None:
-        self.canceled += self.queue_length
-        self._waiting.clear()
-        self._running = None
-        if self._wake_timer is not None:
-            self._wake_timer.cancel()
-            self._wake_timer = None
 
     # -- faults
 
@@ -522,9 +385,10 @@ class SparkCore:
         match fault.name:
             case "mute":
                 self._muted = True
-                self._for("mute", amount, self._unmute)
+                self._timers.start("mute", amount, self._unmute)
             case "stall":
-                self._stall(amount)
+                self._execution.stall()
+                self._timers.start("stall", amount, self._end_stall)
             case "reboot":
                 self.boot()
             case "silent-reboot":
@@ -539,9 +403,10 @@ class SparkCore:
             case "queue-full":
                 self._refuse_next += 1
             case "slow":
-                self._delay = self._options.answer_delay + (DEFAULT_SLOW if amount is None else amount)
+                later = DEFAULT_SLOW if amount is None else amount
+                self._answers.delay = self._options.answer_delay + later
             case "drop-answer":
-                self._drop_answers += 1
+                self._answers.drop_next()
             case "error":
                 self._up(replies.error("simulated error" if fault.text is None else fault.text))
             case _:
@@ -551,73 +416,13 @@ class SparkCore:
     def _unmute(self) -> None:
         self._muted = False
 
-    def _stall(self, seconds: float | None) -> None:
-        now = self._clock()
-        if self._stalled_at is None:
-            self._stalled_at = now
-            self._motion.pause(now)
-        if self._wake_timer is not None:
-            self._wake_timer.cancel()
-            self._wake_timer = None
-        self._for("stall", seconds, self._end_stall)
-
     def _end_stall(self) -> None:
-        if self._stalled_at is None:
-            return
-        now = self._clock()
-        if self._running is None:
-            self._due = now
-            self._stalled_at = None
-            self._start_next()
-        else:
-            self._due += now - self._stalled_at
-            self._motion.resume(now)
-            self._stalled_at = None
-        self._advance(now)
+        self._execution.resume()
         self._choose_path()
 
     def _fail(self) -> None:
         """Enter fault mode (Spark serial protocol, fault): motion ends, only reports still work."""
-        self._motion.halt(self._clock())
-        self._drop_commands()
+        self._execution.motion.halt(self._clock())
+        self.canceled += self._execution.drop()
         self._failed = True
         self._up(replies.FAULT)
-
-    # -- timers
-
-    def _for(self, name: str, seconds: float | None, end: Callable[[], None]) -> None:
-        """Call ``end`` after ``seconds``; never when that is None."""
-        self._cancel_timer(name)
-        if seconds is not None:
-            self._after(name, seconds, end)
-
-    def _after(self, name: str, seconds: float, call: Callable[[], None]) -> None:
-        def due() -> None:
-            self._timers.pop(name, None)
-            call()
-
-        self._cancel_timer(name)
-        self._timers[name] = self._loop.call_later(seconds, due)
-
-    def _cancel_timer(self, name: str) -> None:
-        timer = self._timers.pop(name, None)
-        if timer is not None:
-            timer.cancel()
-
-
-def _is_command(line: bytes) -> bool:
-    """Return whether a line would be counted as a command."""
-    return bool(line.strip()) and line[:1] != b"?" and line != b"!" and line[:5] != b"fset "
-
-
-def _problem(line: bytes) -> str | None:
-    """Return what is wrong with a command, None when nothing is."""
-    if line[:1] in (b"G", b"M"):
-        known = _COMMAND.fullmatch(line) or _HOME.fullmatch(line)
-        return None if known else "invalid command"
-    word = line.split(None, 1)[0]
-    if word == b"set":
-        return None if _SET.fullmatch(line) else "invalid set"
-    if line.rstrip() in (b"get", b"stat"):
-        return None
-    return "unknown command"

@@ -1,0 +1,1 @@
+"""G-code as files: their names, and what a slicer wrote into them."""
