@@ -3,15 +3,18 @@
 import asyncio
 import contextlib
 import logging
+import sqlite3
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import msgspec
 from starlette.routing import BaseRoute, Mount, Router
 
 from toolpost.commlog import CommLog
 from toolpost.config import Address, Config, machine_addresses, main_addresses, without_effect
 from toolpost.dialects.spooler.api import SpoolerApi
 from toolpost.dialects.spooler.routes import spooler_routes
+from toolpost.errors import StartError, StorageError
 from toolpost.events import Events
 from toolpost.http.body import BodyReader
 from toolpost.http.gate import Gate
@@ -57,9 +60,12 @@ class App:
             ConfigError: the configuration is wrong.
         """
         async with contextlib.AsyncExitStack() as opened:
-            machines, listeners = self._open(opened)
-            for machine in machines:
-                machine.start()
+            try:
+                machines, listeners = self._open(opened)
+                for machine in machines:
+                    machine.start()
+            except (OSError, sqlite3.Error, msgspec.MsgspecError, StorageError) as error:
+                raise StartError(f"data directory {self._data}: {error}") from None
             for listener in listeners:
                 await listener.open()
                 ready(listener.url)

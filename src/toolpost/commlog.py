@@ -24,6 +24,7 @@ log = logging.getLogger(__name__)
 
 _FLUSH_AFTER = 0.02
 _SYNC_EVERY = 1.0
+_CLOSE_TIMEOUT = 5.0
 _PRINTABLE = bytes(range(0x20, 0x7F)) + b"\n"
 
 
@@ -65,8 +66,10 @@ class CommLog:
         self._date = ""
         self._timer: asyncio.TimerHandle | None = None
         self._queue: queue.SimpleQueue[list[bytes] | None] = queue.SimpleQueue()
-        self._unwritten = 0
-        self._thread = threading.Thread(target=self._write_all, name=f"commlog-{machine}")
+        # Each of the two counts is changed by one thread only.
+        self._queued_bytes = 0
+        self._written_bytes = 0
+        self._thread = threading.Thread(target=self._write_all, name=f"commlog-{machine}", daemon=True)
         self._thread.start()
 
     def up(self, lines: list[bytes]) -> None:
@@ -90,7 +93,9 @@ class CommLog:
         """Write and sync all that is pending and stop the thread."""
         self._flush()
         self._queue.put(None)
-        self._thread.join()
+        self._thread.join(_CLOSE_TIMEOUT)
+        if self._thread.is_alive():
+            log.error("the comm log was not finished in %g s: the disk hangs", _CLOSE_TIMEOUT)
 
     def _prefix(self, word: bytes) -> bytes:
         now_ms = time.time_ns() // 1_000_000
@@ -101,7 +106,8 @@ class CommLog:
         return b"%s.%03d+00:00 %s " % (self._date.encode(), ms, word)
 
     def _add(self, block: bytes) -> None:
-        if self._pending_bytes + self._unwritten > self._limits.backlog_bytes:
+        backlog = self._pending_bytes + self._queued_bytes - self._written_bytes
+        if backlog > self._limits.backlog_bytes:
             self._dropped += block.count(b"\n")
             return
         if self._dropped:
@@ -118,7 +124,7 @@ class CommLog:
             self._timer.cancel()
             self._timer = None
         if self._pending:
-            self._unwritten += self._pending_bytes
+            self._queued_bytes += self._pending_bytes
             self._queue.put(self._pending)
             self._pending, self._pending_bytes = [], 0
 
@@ -137,7 +143,7 @@ class CommLog:
                 break
             data = b"".join(batch)
             self._files.write(data)
-            self._unwritten -= len(data)
+            self._written_bytes += len(data)
             if sync_at is None:
                 sync_at = time.monotonic() + _SYNC_EVERY
             elif sync_at <= time.monotonic():

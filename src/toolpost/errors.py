@@ -31,6 +31,10 @@ class StorageError(ToolpostError):
     """The disk did not take what had to be stored. Nothing of the request was kept."""
 
 
+class ProgramError(StorageError):
+    """A stored program is missing or is not what it was."""
+
+
 class ConfigError(ToolpostError):
     """The configuration is wrong. The message names the key and the fix."""
 

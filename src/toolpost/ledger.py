@@ -26,6 +26,7 @@ SYSTEM = "system"
 """The actor of what Toolpost does by itself."""
 
 _RETRY_AFTER = 1.0
+_TRIM_EVERY = 100
 
 
 class Ledger:
@@ -72,9 +73,9 @@ class Ledger:
         """Go through the jobs in the order of adding; those that are not on disk yet are left out."""
         return (job for seq, job in self._jobs.items() if seq not in self._unsaved)
 
-    def get(self, seq: int) -> Job:
-        """Return a job as it is now."""
-        return self._jobs[seq]
+    def get(self, seq: int) -> Job | None:
+        """Return a job as it is now; None if it has ended and is not shown any more."""
+        return self._jobs.get(seq)
 
     @property
     def open(self) -> list[Job]:
@@ -111,6 +112,8 @@ class Ledger:
         self._put(job)
         self._unsaved.add(seq)
         self._pay_debts()
+        if seq % _TRIM_EVERY == 0:
+            self._store.trim(self._machine, self._keep_stored)
         future = self._store.add(job, actor)
         # Not after the await: whoever waits may be canceled, and the job is on disk or is not all the same.
         future.add_done_callback(partial(self._added, job))
@@ -129,15 +132,16 @@ class Ledger:
         try:
             await asyncio.shield(self._store.update(job, now_us(), actor))
         except StorageError:
-            if self._jobs[job.seq] is job:
+            if self._jobs.get(job.seq) is job:
                 self._put(before)
             raise
         self._changed(job)
 
     def explain(self, job: Job, reason: Reason) -> None:
         """Say why a pending job waits; it changes with the machine, so it is not stored."""
-        if self._jobs[job.seq].state is JobState.PENDING:
-            self._put(msgspec.structs.replace(self._jobs[job.seq], reason=reason))
+        job = self._jobs.get(job.seq, job)
+        if job.state is JobState.PENDING:
+            self._put(msgspec.structs.replace(job, reason=reason))
 
     def declare(self, job: Job, actor: str = SYSTEM) -> "asyncio.Future[None]":
         """Make a transition that has happened already; the future tells whether the disk took it at once.

@@ -80,7 +80,7 @@ class Machine:
             self.driver.stop()
             if job is not None and running:
                 ended = job.to(JobState.ABORTED, Reason.HOST_STOPPED, now_us(), "Toolpost was stopped")
-                await asyncio.wait([self.ledger.declare(ended)])
+                await asyncio.wait([self.ledger.declare(ended)], timeout=_STOP_TIMEOUT)
             await self.driver.stopped(_STOP_TIMEOUT)
         for task in self._tasks:
             task.cancel()
@@ -107,8 +107,10 @@ class Machine:
     def session_started(self) -> None:
         """The machine has just booted or been connected."""
         if self.config.auto_init:
-            for line in self.driver.commands(self.init_lines):
-                self.driver.enqueue(line)
+            commands = self.driver.commands(self.init_lines)
+            refused = [line for line in commands if not self.driver.enqueue(line)]
+            if refused:
+                log.error("%s: %d init lines could not be sent", self.name, len(refused))
 
     def changed(self) -> None:
         """The machine's state has changed."""

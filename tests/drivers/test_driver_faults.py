@@ -212,3 +212,107 @@ def test_a_stop_while_offline_is_sent_when_the_link_is_back(tmp_path):
             assert bench.received[0] == b"!"
 
     asyncio.run(run())
+
+
+def test_a_link_that_breaks_at_the_start_leaves_nothing_to_be_sent_later(tmp_path):
+    """The first line sent finds the link broken: the run has failed, and is not taken up by the next link."""
+
+    async def run():
+        async with driving(tmp_path, SLOWISH) as bench:
+            bench.simulated._disconnect()
+            ending = await bench.run(moves(100), {"?pos": 1.0})
+            assert (ending.outcome, ending.reason) == (Outcome.FAILED, Reason.LINK_LOST)
+            await bench.ready()
+            await asyncio.sleep(0.2)
+            assert bench.executed == []
+
+    asyncio.run(run())
+
+
+def test_a_stop_is_owed_until_the_core_has_answered_it(tmp_path):
+    async def run():
+        async with driving(tmp_path, CoreOptions(command_time=0.05, hold_off=0.0)) as bench:
+            bench.driver.enqueue(b"G4 P5")
+            bench.inject("unplug:0.1")
+            await bench.until(lambda: not bench.driver.state.alive)
+            bench.driver.stop()
+            await bench.until(lambda: bench.driver._link is not None)
+            bench.simulated._disconnect()  # The stop has been written, and is lost with the link.
+            bench.received.clear()
+            await bench.ready()
+            assert bench.received[0] == b"!"
+
+    asyncio.run(run())
+
+
+def test_a_core_that_fell_silent_is_noticed_although_clients_go_on_asking(tmp_path):
+    async def run():
+        async with driving(tmp_path, SLOWISH) as bench:
+            run = asyncio.create_task(bench.run(moves(2000), {"?queue": 0.05}))
+            await bench.until(lambda: bench.executed)
+            bench.inject("mute:3")
+            assert (await run).reason is Reason.MACHINE_SILENT
+
+    asyncio.run(run())
+
+
+def test_a_fault_outlasts_the_link(tmp_path):
+    async def run():
+        async with driving(tmp_path, SLOWISH) as bench:
+            bench.inject("fault")
+            await bench.until(lambda: bench.driver.state.link is LinkState.FAULT)
+            bench.inject("unplug:0.1")
+            await bench.until(lambda: bench.driver.state.link is LinkState.OFFLINE)
+            await bench.until(lambda: bench.driver.state.link is LinkState.FAULT)
+            assert not bench.driver.ready
+            bench.inject("reboot")
+            await bench.ready()
+
+    asyncio.run(run())
+
+
+def test_an_urgent_command_is_refused_while_it_would_be_lost(tmp_path):
+    async def run():
+        async with driving(tmp_path, CoreOptions(capacity=8, command_time=0.05, hold_off=0.1)) as bench:
+            run = asyncio.create_task(bench.run(moves(100)))
+            await bench.until(lambda: bench.executed)
+            taken = [bench.driver.send_now(b"G4 P0.001") for _ in range(30)]
+            assert not all(taken)
+            await asyncio.sleep(0.2)
+            assert bench.core.lost == 0
+            bench.driver.stop()
+            assert not bench.driver.send_now(b"G1 X1"), "within the hold-off"
+            await run
+
+    asyncio.run(run())
+
+
+def test_commands_sent_right_after_a_cores_hold_off_are_executed(tmp_path):
+    """The core counts from the arrival of the stop, so the driver must not count from its sending."""
+
+    async def run():
+        async with driving(tmp_path, CoreOptions(command_time=0.0, hold_off=0.05)) as bench:
+            for number in range(10):
+                bench.driver.stop()
+                await bench.ready()
+                bench.executed.clear()
+                ending = await bench.run([b"G1 X%d" % number])
+                assert ending.outcome is Outcome.COMPLETED
+                assert bench.executed == [b"G1 X%d" % number], "completed means executed"
+
+    asyncio.run(run())
+
+
+def test_init_lines_can_be_sent_after_a_long_power_off(tmp_path):
+    async def run():
+        async with driving(tmp_path, SLOWISH) as bench:
+            bench.inject("mute:0.6")
+            await bench.until(lambda: bench.driver.state.link is LinkState.OFFLINE)
+            taken = []
+            bench.session_started = lambda: taken.append(bench.driver.enqueue(b"set a.b 1"))
+            await asyncio.sleep(0.6)
+            bench.inject("reboot")
+            await bench.until(lambda: bench.executed == [b"set a.b 1"], 2.0)
+            assert taken == [True]
+
+    asyncio.run(run())

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from toolpost.errors import StorageError
+from toolpost.errors import ProgramError, StorageError
 from toolpost.store import programs as module
 from toolpost.store.programs import ProgramStore
 
@@ -62,7 +62,7 @@ def test_a_program_of_nothing(tmp_path):
 
 
 def test_a_program_that_is_not_there(tmp_path):
-    with pytest.raises(StorageError, match="program 000000000000 cannot be read: No such file"):
+    with pytest.raises(StorageError, match="program 000000000000 is missing"):
         store_in(tmp_path).open("0" * 64)
 
 
@@ -124,9 +124,10 @@ def age(tmp_path, program, seconds):
 def test_trim_deletes_the_oldest_that_no_job_needs(tmp_path):
     store = store_in(tmp_path)
     names = [age(tmp_path, store.add([[b"%d" % n * 99]]), n) for n in range(10)]
-    store.trim({names[0]}, 1000)
+    each = (tmp_path / "programs" / names[0]).stat().st_blocks * 512
+    store.trim({names[0]}, 10 * each)
     assert len(files(tmp_path)) == 10, "no more than allowed"
-    store.trim({names[0], names[2]}, 600)
+    store.trim({names[0], names[2]}, 6 * each)
     assert files(tmp_path) == sorted([names[0], names[2], *names[7:]])
 
 
@@ -155,7 +156,8 @@ def test_trim_spares_what_is_just_being_written(tmp_path):
 def test_the_total_is_known_after_a_restart(tmp_path):
     store = store_in(tmp_path)
     names = [age(tmp_path, store.add([[b"%d" % n * 99]]), n) for n in range(4)]
-    store_in(tmp_path).trim(set(), 200)
+    each = (tmp_path / "programs" / names[0]).stat().st_blocks * 512
+    store_in(tmp_path).trim(set(), 2 * each)
     assert files(tmp_path) == [names[3]]
 
 
@@ -214,3 +216,13 @@ def test_the_content_is_synced_before_it_has_its_name(tmp_path, monkeypatch):
     monkeypatch.setattr(module.Path, "rename", lambda a, b: steps.append("rename") or rename(a, b))
     store.add([[b"G1"]])
     assert steps == ["sync", "rename", "sync"]
+
+
+@pytest.mark.parametrize("damage", [lambda data: data[:-4], lambda data: data[:-2] + b"9\n", lambda _: b""])
+def test_a_program_that_is_not_what_it_was_is_not_opened(tmp_path, damage):
+    store = ProgramStore(tmp_path)
+    program = store.add([[b"G1 X1", b"G1 X2"]])
+    path = tmp_path / program.sha256
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(ProgramError, match="is damaged"):
+        store.open(program.sha256)

@@ -5,6 +5,7 @@ import logging
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any, NoReturn
@@ -13,6 +14,9 @@ import click
 
 from toolpost.config import DEFAULT, Config, load
 from toolpost.errors import ToolpostError
+
+STOP_TIMEOUT = 20.0
+"""Seconds within which a server must have stopped; a disk that hangs does not hold it up for longer."""
 
 
 def default_data_directory() -> Path:
@@ -65,10 +69,28 @@ def run(main: Callable[[], Coroutine[Any, Any, None]]) -> None:
 
 
 def on_stop_signals(stop: Callable[[], None]) -> None:
-    """Call `stop` on SIGTERM and SIGINT."""
+    """Call `stop` on SIGTERM and SIGINT; a second one, or `STOP_TIMEOUT` seconds, end the program at once."""
+    stopping = False
+
+    def handle() -> None:
+        nonlocal stopping
+        if stopping:
+            _exit_at_once("stopped again")
+        stopping = True
+        watchdog = threading.Timer(STOP_TIMEOUT, _exit_at_once, ["could not stop in time"])
+        watchdog.daemon = True
+        watchdog.start()
+        stop()
+
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, stop)
+        loop.add_signal_handler(number, handle)
+
+
+def _exit_at_once(reason: str) -> None:
+    sys.stderr.write(f"toolpost: {reason}; ending without more ado\n")
+    sys.stderr.flush()
+    os._exit(1)
 
 
 def fail(error: object) -> NoReturn:

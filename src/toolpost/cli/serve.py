@@ -2,6 +2,7 @@
 
 import gc
 import os
+import resource
 from pathlib import Path
 
 import click
@@ -23,6 +24,8 @@ from toolpost.errors import ConfigError
 def command(config: Path | None, data: Path, listen: tuple[str, ...], *, verbose: bool) -> None:
     """Drive the machines and answer requests until SIGTERM."""
     os.umask(os.umask(0o027) | 0o027)
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
     set_up_logging(verbose=verbose)
     settings = read_config(config)
     addresses = _addresses(listen)

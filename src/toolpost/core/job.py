@@ -35,6 +35,7 @@ class Reason(enum.StrEnum):
     CANCELED_BY_USER = "canceled-by-user"
     HOST_RESTARTED = "host-restarted"
     HOST_STOPPED = "host-stopped"
+    INTERNAL_ERROR = "internal-error"
     LINK_LOST = "link-lost"
     MACHINE_FAULT = "machine-fault"
     MACHINE_RESET = "machine-reset"

@@ -29,6 +29,7 @@ _MAX_VALUE = 1e9
 _MAX_HEIGHT = 1e5
 _MAX_ITEMS = 64
 
+_COMMENT_LINE = re.compile(rb"\n;[^\r\n]*")
 _COMMENT = re.compile(rb"^;[ \t]{0,8}([A-Za-z][^=:,\r\n]{0,63})[=:,]([^\r\n]*)", re.MULTILINE)
 _NO_LETTERS = bytes(byte for byte in range(256) if not chr(byte).isascii() or not chr(byte).isalnum())
 _NUMBER = re.compile(rb"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?")
@@ -45,7 +46,7 @@ _NOZZLE = re.compile(rb"^M10[49][ \t][^;\r\n]{0,40}?S(\d+\.?\d*)", re.MULTILINE)
 _BED = re.compile(rb"^M1[49]0[ \t][^;\r\n]{0,40}?S(\d+\.?\d*)", re.MULTILINE)
 _LAYER_Z = re.compile(rb"^;Z:[ \t]?(\d+\.?\d*)", re.MULTILINE)
 _S3D_LAYER = re.compile(rb"^; layer (\d{1,7}), Z = (\d+\.?\d*)", re.MULTILINE)
-_IDEA_HEIGHT = re.compile(rb"^;LAYER:(\d{1,7})[^G]{0,200}?^;HEIGHT:[ \t]?(\d+\.?\d*)", re.MULTILINE)
+_IDEA_HEIGHT = re.compile(rb"^;LAYER:(\d{1,7})[^G]{0,64}?^;HEIGHT:[ \t]?(\d+\.?\d*)", re.MULTILINE)
 _IDEA_LAYER = re.compile(rb"^;LAYER:(\d{1,7})", re.MULTILINE)
 
 _VERSION = rb"([0-9A-Za-z][\w.+~-]{0,47})"
@@ -144,8 +145,11 @@ def parse_metadata(head: bytes, tail: bytes = b"", offset: int = 0) -> Metadata:
         tail: the last bytes, none that are in `head`.
         offset: where in the file `tail` begins.
     """
-    slicer, version = _slicer(head)
-    values = _Values(head, tail)
+    # Most of a file are commands; without them, all that follows is done in no time.
+    comments = b"".join(_COMMENT_LINE.findall(b"\n" + head))
+    endings = b"".join(_COMMENT_LINE.findall(tail)) if tail else comments
+    slicer, version = _slicer(comments)
+    values = _Values(comments + endings if tail else comments)
     weights = values.numbers(b"filamentusedg")
     # A few slicers leave to the layers what others say in a line.
     top = values.number(b"maxzheight", b"maxz", b"printsizemaxz")
@@ -159,19 +163,20 @@ def parse_metadata(head: bytes, tail: bytes = b"", offset: int = 0) -> Metadata:
     )
     nozzle = values.number(b"nozzlediameter", b"extruderdiameter", b"extrudertrain0nozzlediameter")
     if slicer == "IdeaMaker":
-        heights = {int(layer): _number(height) for layer, height in _IDEA_HEIGHT.findall(head)}
-        first_height, layer_height = heights.get(0), heights.get(1)
-        layers = max((int(number) + 1 for number in _IDEA_LAYER.findall(tail or head)), default=None)
+        heights = _IDEA_HEIGHT.findall(comments) + _IDEA_HEIGHT.findall(endings)
+        first_height = next((_number(height) for layer, height in heights if not int(layer)), None)
+        layer_height = next((_number(height) for layer, height in heights if int(layer)), None)
+        layers = max((int(number) + 1 for number in _IDEA_LAYER.findall(endings)), default=None)
         top = _last(values.numbers(b"boundingbox"))
         nozzle = nozzle or _last(values.numbers(b"dimension")[:4])
         weight = weight or values.ideamaker_weight()
     elif slicer == "Simplify3D":
         percent = values.number(b"firstlayerheightpercentage")
         first_height = layer_height * percent / 100 if layer_height and percent else first_height
-        last = _last(_S3D_LAYER.findall(tail or head))
+        last = _last(_S3D_LAYER.findall(endings))
         layers, top = (int(last[0]), _number(last[1])) if last else (layers, top)
     if top is None:
-        top = max(filter(None, map(_number, _LAYER_Z.findall(tail or head))), default=None)
+        top = max(filter(None, map(_number, _LAYER_Z.findall(endings))), default=None)
     first = _FIRST_COMMAND.search(head)
     return Metadata(
         slicer=slicer,
@@ -203,13 +208,12 @@ def parse_metadata(head: bytes, tail: bytes = b"", offset: int = 0) -> Metadata:
 
 
 class _Values:
-    """The values of the comments, by their names without case, blanks and signs; the last of a name holds."""
+    """The values of comments by their names, without case, blanks and signs."""
 
-    def __init__(self, head: bytes, tail: bytes) -> None:
-        self._values: dict[bytes, bytes] = {}
-        for part in (head, tail):
-            for key, value in _COMMENT.findall(part):
-                self._values[key.translate(None, _NO_LETTERS).lower()] = value
+    def __init__(self, comments: bytes) -> None:
+        # The last of a name holds: settings at the end outdo remarks in the commands before.
+        found = dict(_COMMENT.findall(comments))
+        self._values = {key.translate(None, _NO_LETTERS).lower(): value for key, value in found.items()}
 
     def _get(self, keys: Iterable[bytes]) -> bytes:
         return next((value for key in keys if (value := self._values.get(key, b"").strip())), b"")
@@ -279,12 +283,12 @@ class _Values:
         return self.number(b"firstlayerbedtemperature", _BEDS.get(kind, b""), b"buildplateinitialtemperature")
 
 
-def _slicer(head: bytes) -> tuple[str | None, str | None]:
+def _slicer(comments: bytes) -> tuple[str | None, str | None]:
     for pattern, name in _SLICERS:
-        match = pattern.search(head)
+        match = pattern.search(comments)
         if match:
             return name, match[1].decode("utf-8", "replace")
-    match = _GENERATED.search(head)
+    match = _GENERATED.search(comments)
     return (
         (match[1].decode("ascii", "replace"), match[2].decode("ascii", "replace")) if match else (None, None)
     )
@@ -305,7 +309,7 @@ def _last(items: Sequence[T]) -> T | None:
 
 
 def _first_number(pattern: re.Pattern[bytes], data: bytes) -> float | None:
-    return next((number for text in pattern.findall(data) if (number := _number(text))), None)
+    return next((number for match in pattern.finditer(data) if (number := _number(match[1]))), None)
 
 
 def _seconds(text: bytes) -> int | None:

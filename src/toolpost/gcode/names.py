@@ -67,8 +67,13 @@ def is_gcode(name: str) -> bool:
     return name.lower().endswith(GCODE_SUFFIXES)
 
 
-def is_part(text: str) -> bool:
+def is_name(name: str) -> bool:
     """Return whether a file or directory may be called so."""
+    return _problem(name) is None
+
+
+def is_part(text: str) -> bool:
+    """Return whether a file or directory may be called so within its directory."""
     return "/" not in text and _problem(text) is None
 
 

@@ -21,9 +21,10 @@ MAX_SIDE: Final = 2048
 """Largest width and height, pixels."""
 
 _BEGIN = re.compile(
-    rb"^; ?thumbnail(_JPG|_PNG)? begin[ \t]+(\d{1,4})[x \t](\d{1,4})[ \t]+(\d{1,7})[ \t]*\r?\n", re.MULTILINE
+    rb"^; thumbnail(?:_JPG|_PNG)? begin[ \t]+(\d{1,4})[x \t](\d{1,4})[ \t]+\d{1,7}[ \t]*\r?\n", re.MULTILINE
 )
-_END = re.compile(rb"^; ?thumbnail(?:_\w{1,8})? end", re.MULTILINE)
+_END = re.compile(rb"^; thumbnail(?:_\w{1,8})? end", re.MULTILINE)
+_MARK = b"; thumbnail"
 _FORMATS = {"png": b"\x89PNG\r\n\x1a\n", "jpg": b"\xff\xd8\xff"}
 _PATH = re.compile(r"(?:(.*)/)?\.thumbs/([^/]+)-(\d{1,4})x(\d{1,4})\.(png|jpg)", re.DOTALL)
 
@@ -53,12 +54,14 @@ def find_thumbnails(head: bytes) -> tuple[Thumbnail, ...]:
     found = []
     at = 0
     for _ in range(MAX_THUMBNAILS):
-        begin = _BEGIN.search(head, at)
+        # The plain search is many times faster, and most of a file are commands.
+        at = head.find(_MARK, at)
+        begin = _BEGIN.search(head, at) if at >= 0 else None
         end = _END.search(head, begin.end()) if begin else None
         if begin is None or end is None:
             break
         at = end.end()
-        width, height = int(begin[2]), int(begin[3])
+        width, height = int(begin[1]), int(begin[2])
         picture = _decode(head[begin.end() : end.start()])
         kind = next((name for name, magic in _FORMATS.items() if picture.startswith(magic)), None)
         if kind is not None and 0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE:

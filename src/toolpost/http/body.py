@@ -38,21 +38,26 @@ class BodyReader:
         self._max_total = max_total
         self._held = 0
 
-    async def read(self, receive: Receive) -> bytes | bytearray:
+    async def read(self, receive: Receive, most: int | None = None) -> bytes | bytearray:
         """Return the body.
+
+        Args:
+            receive: from where (ASGI).
+            most: longest body of this call, where that is less than what the server takes.
 
         Raises:
             BodyError: it is too long, does not come, or there is no room for it now.
         """
+        most = self._max_bytes if most is None else min(most, self._max_bytes)
         message = await self._next(receive)
         body: bytes = message.get("body", b"")
         if not message.get("more_body", False):
-            if len(body) > self._max_bytes:
-                raise BodyTooLargeError(f"the body must be at most {self._max_bytes} bytes")
+            if len(body) > most:
+                raise BodyTooLargeError(f"the body must be at most {most} bytes")
             return body
-        return await self._read_rest(body, receive)
+        return await self._read_rest(body, receive, most)
 
-    async def _read_rest(self, first: bytes, receive: Receive) -> bytearray:
+    async def _read_rest(self, first: bytes, receive: Receive, most: int) -> bytearray:
         body = bytearray(first)
         self._held += len(first)
         try:
@@ -63,8 +68,8 @@ class BodyReader:
                 body += chunk
                 self._held += len(chunk)
                 more = message.get("more_body", False)
-                if len(body) > self._max_bytes:
-                    raise BodyTooLargeError(f"the body must be at most {self._max_bytes} bytes")
+                if len(body) > most:
+                    raise BodyTooLargeError(f"the body must be at most {most} bytes")
                 if self._held > self._max_total:
                     raise BodyBusyError("too many large requests at the same time; try again")
         finally:

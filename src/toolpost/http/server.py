@@ -47,6 +47,8 @@ class BoundedProtocol(HttpToolsProtocol):
     def connection_made(self, transport: Any) -> None:  # noqa: ANN401  # as the base class has it
         """Begin to wait for the first head."""
         super().connection_made(transport)
+        if len(self.connections) > (self.limit_concurrency or 0):
+            transport.abort()
         self._head_bytes = 0
         self._own_unread = 0
         self._stall_timer: asyncio.TimerHandle | None = None
@@ -152,7 +154,11 @@ class Listener(uvicorn.Server):
     async def open(self) -> None:
         """Begin to answer; requests are taken when this returns."""
         self._task = asyncio.create_task(self.serve([self._socket]), name=f"listener {self.url}")
-        await self._ready.wait()
+        ready = asyncio.create_task(self._ready.wait())
+        await asyncio.wait([ready, self._task], return_when=asyncio.FIRST_COMPLETED)
+        ready.cancel()
+        if self._task.done():
+            await self._task
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Say that requests are taken."""

@@ -58,6 +58,7 @@ def _open(path: Path, baud: int) -> _Port:
     except OSError as error:
         raise LinkError(f"{path}: {error.strerror or error}") from None
     # TIOCEXCL does not stop root, and a second reader steals bytes: the lock is asked for as well.
+    fcntl.ioctl(port.fileno(), termios.TIOCEXCL)
     try:
         fcntl.flock(port.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from toolpost.links.base import LinkListener
 
 _READ_SIZE = 65536
+_READS_AT_ONCE = 8
 
 
 class StreamLink:
@@ -101,17 +102,21 @@ class StreamLink:
             self._listener.drained()
 
     def _readable(self) -> None:
-        try:
-            data = os.read(self._fd, _READ_SIZE)
-        except (BlockingIOError, InterruptedError):
-            return
-        except OSError as error:
-            self._fail(f"read failed: {error.strerror}")
-            return
-        if data:
+        # A broken connection may be told once only, with its last bytes: read on until none are left.
+        for _ in range(_READS_AT_ONCE):
+            try:
+                data = os.read(self._fd, _READ_SIZE)
+            except (BlockingIOError, InterruptedError):
+                return
+            except OSError as error:
+                self._fail(f"read failed: {error.strerror}")
+                return
+            if not data:
+                self._fail("the other end is gone")
+                return
             self._listener.received(data)
-        else:
-            self._fail("the other end is gone")
+            if not self._open:
+                return
 
     def _fail(self, reason: str) -> None:
         if self._open:

@@ -96,12 +96,12 @@ class Execution:
             return
         now = self._clock()
         stalled_at, self._stalled_at = self._stalled_at, None
+        self.motion.resume(now)
         if self.running is None:
             self._due = now
             self._start_next()
         else:
             self._due += now - stalled_at
-            self.motion.resume(now)
         self.advance(now)
 
     def drop(self) -> int:

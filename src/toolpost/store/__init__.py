@@ -21,10 +21,14 @@ class Store:
 
     def __init__(self, directory: Path) -> None:
         self._database = Database(directory / "toolpost.db")
-        self.jobs = JobStore(self._database)
-        self.settings = SettingStore(self._database)
-        self.keys = KeyStore(self._database)
-        self.programs = ProgramStore(directory / "programs")
+        try:
+            self.jobs = JobStore(self._database)
+            self.settings = SettingStore(self._database)
+            self.keys = KeyStore(self._database)
+            self.programs = ProgramStore(directory / "programs")
+        except BaseException:
+            self._database.close()
+            raise
 
     def close(self) -> None:
         """Make durable what is queued and close."""

@@ -5,6 +5,8 @@ next one together, so that many callers share one sync. A change is on disk when
 """
 
 import asyncio
+import contextlib
+import logging
 import queue
 import sqlite3
 import threading
@@ -21,6 +23,11 @@ T = TypeVar("T")
 Rows: TypeAlias = list[tuple[Any, ...]]
 
 QUERIES = load_queries()
+
+CLOSE_TIMEOUT = 5.0
+"""Seconds that a close waits for changes to be made."""
+
+log = logging.getLogger(__name__)
 
 
 class _Change(msgspec.Struct):
@@ -45,12 +52,14 @@ class Database:
     def __init__(self, path: Path) -> None:
         try:
             self._connection = _open(path)
+            # Its own connection: a read on the event loop must not wait for a commit to be synced.
+            self._reader = sqlite3.connect(f"file:{path}?mode=ro", uri=True)
         except sqlite3.Error as error:
             raise StartError(f"{path}: {error}") from None
         self._version = 0
         self._changes: queue.SimpleQueue[_Change | None] = queue.SimpleQueue()
         self._loop = asyncio.get_running_loop()
-        self._thread = threading.Thread(target=self._write_all, name="database")
+        self._thread = threading.Thread(target=self._write_all, name="database", daemon=True)
         self._thread.start()
 
     async def write(self, apply: Callable[[sqlite3.Connection], T]) -> T:
@@ -70,20 +79,24 @@ class Database:
         return future
 
     def read(self, name: str, /, **parameters: object) -> Rows:
-        """Return the rows of a named query; for use before and after the writer is busy."""
-        return cast("Rows", self._connection.execute(QUERIES[name], parameters).fetchall())
+        """Return the rows of a named query, as they are on disk now."""
+        return cast("Rows", self._reader.execute(QUERIES[name], parameters).fetchall())
 
     def changed_elsewhere(self) -> bool:
         """Whether another process has changed the database since the last call."""
-        version: int = self._connection.execute("PRAGMA data_version").fetchone()[0]
+        version: int = self._reader.execute("PRAGMA data_version").fetchone()[0]
         changed, self._version = version != self._version, version
         return changed
 
     def close(self) -> None:
-        """Make the changes already queued and close the file."""
+        """Make the changes already queued and close the file; a disk that hangs is not waited for long."""
+        self._reader.close()
         self._changes.put(None)
-        self._thread.join()
-        self._connection.close()
+        self._thread.join(CLOSE_TIMEOUT)
+        if self._thread.is_alive():
+            log.error("the database did not finish in %g s: the disk hangs", CLOSE_TIMEOUT)
+        else:
+            self._connection.close()
 
     def _write_all(self) -> None:
         """Make changes until None comes; runs in the thread."""
@@ -117,7 +130,8 @@ class Database:
             for change in changes:
                 change.error = change.error or error
             if connection.in_transaction:
-                connection.execute("ROLLBACK")
+                with contextlib.suppress(sqlite3.Error):
+                    connection.execute("ROLLBACK")
 
 
 def _tell(changes: list[_Change]) -> None:

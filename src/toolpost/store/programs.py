@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from toolpost.core.program import Program
-from toolpost.errors import StorageError
+from toolpost.errors import ProgramError, StorageError
 
 _READ_SIZE = 256 * 1024
 _TRIM_TO = 0.9
@@ -28,7 +28,7 @@ class ProgramStore:
         directory.mkdir(parents=True, exist_ok=True)
         for left_over in directory.glob("*.part"):
             left_over.unlink(missing_ok=True)
-        self._total = sum(path.stat().st_size for path in directory.iterdir())
+        self._total = sum(_on_disk(path.stat()) for path in directory.iterdir())
 
     def add(self, blocks: Iterable[list[bytes]]) -> Program:
         """Store commands and return their program; it is on disk when this returns. Blocks; for a thread.
@@ -51,8 +51,8 @@ class ProgramStore:
                 file.flush()
                 size = file.tell()
                 os.fsync(file.fileno())
+                self._total += _on_disk(os.fstat(file.fileno()))
             program = Program(digest.hexdigest(), commands, size)
-            self._total += size
             part.rename(self._path(program.sha256))
             _sync_directory(self._directory)
         except OSError as error:
@@ -62,13 +62,20 @@ class ProgramStore:
         return program
 
     def open(self, sha256: str) -> "ProgramReader":
-        """Return a reader of a program.
+        """Return a reader of a program, whose content is what its name says. Blocks.
 
         Raises:
-            StorageError: there is no such program, or it cannot be read.
+            ProgramError: there is no such program, or its content has changed.
+            StorageError: it cannot be read now.
         """
         try:
+            with self._path(sha256).open("rb") as file:
+                digest = hashlib.file_digest(file, "sha256").hexdigest()
+            if digest != sha256:
+                raise ProgramError(f"program {sha256[:12]} is damaged")
             return ProgramReader(self._path(sha256))
+        except FileNotFoundError:
+            raise ProgramError(f"program {sha256[:12]} is missing") from None
         except OSError as error:
             raise StorageError(f"program {sha256[:12]} cannot be read: {error.strerror}") from None
 
@@ -82,13 +89,13 @@ class ProgramStore:
         if self._total <= max_bytes:
             return
         files = [(path, path.stat()) for path in self._directory.iterdir() if path.suffix != ".part"]
-        self._total = sum(stat.st_size for _, stat in files)
+        self._total = sum(_on_disk(stat) for _, stat in files)
         for path, stat in sorted(files, key=lambda file: file[1].st_mtime):
             if self._total <= max_bytes * _TRIM_TO:
                 return
             if path.name not in in_use:
                 path.unlink(missing_ok=True)
-                self._total -= stat.st_size
+                self._total -= _on_disk(stat)
 
     def _path(self, sha256: str) -> Path:
         return self._directory / sha256
@@ -144,6 +151,11 @@ class ProgramReader:
             self._ended = len(data) == 0
             self._commands = (self._cut + data).split(b"\n")
             self._cut = self._commands.pop()
+
+
+def _on_disk(stat: os.stat_result) -> int:
+    """Return the bytes that a file takes on disk."""
+    return stat.st_blocks * 512
 
 
 def _sync_directory(directory: Path) -> None:

@@ -19,6 +19,7 @@ from toolpost.dialects.moonraker.identify import CONNECTION_METHODS
 from toolpost.dialects.moonraker.rpc import Method, Methods
 from toolpost.dialects.moonraker.websocket import ABORT, WebSocketEndpoint
 from toolpost.http.body import BodyReader
+from toolpost.http.server import BoundedProtocol
 
 MAX_BODY = 64 * 1024
 
@@ -46,7 +47,9 @@ class Answer(NamedTuple):
 class Service:
     """What is served, and where."""
 
-    def __init__(self, methods: Iterable[Method] = (), *, limit: int = 256, max_message: int = 1 << 20) -> None:
+    def __init__(
+        self, methods: Iterable[Method] = (), *, limit: int = 256, max_message: int = 1 << 20
+    ) -> None:
         self.connections = Connections(limit)
         self.queue = FakeQueue(self.connections)
         self.methods = Methods([*self.queue.methods, *CONNECTION_METHODS, *methods])
@@ -122,11 +125,12 @@ async def serving(*methods: Method, **options: Any) -> AsyncIterator[Service]:
     server = uvicorn.Server(
         uvicorn.Config(
             service.app,
-            http="httptools",
+            http=BoundedProtocol,
             ws=AbortableWebSocket,
             ws_max_size=2 << 20,
             ws_per_message_deflate=False,
             lifespan="off",
+            limit_concurrency=512,
             log_config=None,
             access_log=False,
             timeout_graceful_shutdown=1,

@@ -1,6 +1,7 @@
-"""What the original answered, section by section (tests/golden/moonraker.jsonl), replayed on a queue in memory."""
+"""What the original answered (tests/golden/moonraker.jsonl, A and B), replayed on a queue in memory."""
 
 import asyncio
+import contextlib
 import json
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,7 +37,9 @@ DIFFERENT = {
     72: Differs(400, NO_BOOL.format("garbage"), UNKNOWN),
     73: Differs(400, NO_BOOL.format("1"), UNKNOWN),
     85: Differs(
-        400, "Invalid JSON in the body: Input data was truncated", "broken JSON is told, not taken for no body"
+        400,
+        "Invalid JSON in the body: Input data was truncated",
+        "broken JSON is told, not taken for no body",
     ),
     87: Differs(400, "Invalid JSON in the body: it must be an object", NOT_OBJECT),
     89: Differs(400, "Invalid JSON in the body: it must be an object", NOT_OBJECT),
@@ -138,26 +141,42 @@ class Replay:
         return (status, response["content_type"], "etag" in response), content
 
 
-@pytest.mark.parametrize("record", RECORDS, ids=lambda r: f"{r['section'][0]}{r['seq']}-{r['name']}")
-def test_replayed(record: dict[str, Any]) -> None:
-    async def replay() -> None:
-        async with serving() as service, service.client() as watcher, service.client() as client:
-            await watcher.call("server.websocket.id")
-            await client.call("server.websocket.id")
-            case = Replay(record, service)
-            head, content = await case.send(client)
-            expected_head, expected = case.expected()
-            assert head == expected_head
-            assert loose(content) == loose(expected)
-            await watcher.call("server.websocket.id")
-            seen = [message["params"] for message in watcher.notifications]
-            recorded = [message["params"] for message in record["notifications"]]
-            if record["seq"] in NOTIFIED:
-                assert len(seen) == NOTIFIED[record["seq"]][0] != len(recorded)
-            else:
-                assert loose(seen) == loose(recorded)
+@pytest.fixture(scope="module")
+def bench():
+    """A server, a client and one that only watches, for all records: starting each anew would take long."""
+    with asyncio.Runner() as runner:
+        stack = contextlib.AsyncExitStack()
 
-    asyncio.run(replay())
+        async def start() -> tuple[Service, Client, Client]:
+            service = await stack.enter_async_context(serving())
+            client = await stack.enter_async_context(service.client())
+            return service, client, await stack.enter_async_context(service.client())
+
+        yield runner, *runner.run(start())
+        runner.run(stack.aclose())
+
+
+@pytest.mark.parametrize("record", RECORDS, ids=lambda r: f"{r['section'][0]}{r['seq']}-{r['name']}")
+def test_replayed(bench: tuple[asyncio.Runner, Service, Client, Client], record: dict[str, Any]) -> None:
+    runner, service, client, watcher = bench
+
+    async def replay() -> None:
+        service.queue.jobs.clear()
+        case = Replay(record, service)
+        head, content = await case.send(client)
+        expected_head, expected = case.expected()
+        assert head == expected_head
+        assert loose(content) == loose(expected)
+        watcher.notifications.clear()
+        await watcher.call("server.websocket.id")
+        seen = [message["params"] for message in watcher.notifications]
+        recorded = [message["params"] for message in record["notifications"]]
+        if record["seq"] in NOTIFIED:
+            assert len(seen) == NOTIFIED[record["seq"]][0] != len(recorded)
+        else:
+            assert loose(seen) == loose(recorded)
+
+    runner.run(replay())
 
 
 def test_the_differences_are_of_records_that_there_are() -> None:

@@ -15,6 +15,7 @@ from toolpost.dialects.moonraker.errors import RpcError, as_rpc_error
 from toolpost.dialects.moonraker.jsonrpc import answer_message, decode_message
 from toolpost.dialects.moonraker.query import decode_arguments
 from toolpost.dialects.moonraker.rpc import Method, Methods
+from toolpost.dialects.moonraker.session import MAX_MESSAGE
 from toolpost.http.body import BodyBusyError, BodyError, BodyReader, BodyTooLargeError
 
 RPC_PATH: Final = "/server/jsonrpc"
@@ -90,7 +91,7 @@ class MethodRoutes(BaseRoute):
 
     async def _read(self, receive: Receive) -> bytes | bytearray:
         try:
-            return await self._bodies.read(receive)
+            return await self._bodies.read(receive, MAX_MESSAGE)
         except BodyTooLargeError as error:
             raise RpcError(413, str(error)) from None
         except BodyBusyError as error:

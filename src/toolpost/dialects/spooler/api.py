@@ -2,6 +2,8 @@
 
 import math
 
+import msgspec
+
 from toolpost.clock import now_us, seconds
 from toolpost.core.grid import SampleGrid
 from toolpost.core.job import Job, JobState
@@ -14,10 +16,13 @@ MAX_COUNT = 10_000
 MAX_KEYS = 1_000
 MAX_VALUES = 250_000
 MAX_LINE = 100
-MAX_INIT_LINES = 100_000
+MAX_INIT_LINES = 25_000
 MIN_INTERVAL = 0.02
 MAX_INTERVAL = 86_400.0
 MAX_SIGNALS = 64
+MAX_SIGNALS_BYTES = 64 * 1024
+
+_INTERVALS = msgspec.json.Decoder(dict[str, float] | None)
 
 _STATUS = {
     JobState.PENDING: "WAITING",
@@ -113,7 +118,9 @@ class SpoolerApi:
         commands = memoryview(request.commands)
         if commands[:5].tobytes() == b"null":
             raise InvalidRequestError("commands: must be given")
-        signals = self._check_signals(request.signals or {}, request.polls or {})
+        signals = self._check_signals(
+            _intervals("signals", request.signals), _intervals("polls", request.polls)
+        )
         try:
             job = await self._shop.submit(self._machine, decode_blocks(commands), signals, actor=actor)
         except NotAcceptedError:
@@ -177,3 +184,16 @@ class SpoolerApi:
             num_sent=None if progress is None else progress.sent,
             num_executed=None if progress is None else progress.executed,
         )
+
+
+def _intervals(name: str, raw: msgspec.Raw) -> dict[str, float]:
+    """Return the lines and intervals of a field that is decoded only if it is small."""
+    data = memoryview(raw)
+    if len(data) > MAX_SIGNALS_BYTES:
+        raise InvalidRequestError(f"{name}: must be at most {MAX_SIGNALS}")
+    try:
+        return _INTERVALS.decode(data) or {}
+    except msgspec.ValidationError as error:
+        problem, _, path = str(error).partition(" - at `$")
+        where = f"$.{name}{path.rstrip('`')}"
+        raise InvalidRequestError(words.name_the_field(f"{problem} - at `{where}`")) from None

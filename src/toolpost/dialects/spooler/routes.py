@@ -3,9 +3,10 @@
 The document knows three status codes: 200, 400 and 500, the last two with words for a person.
 """
 
+import asyncio
 import logging
 from collections.abc import Awaitable, Callable
-from typing import Any
+from typing import Any, Final
 
 import msgspec
 from starlette.routing import Route
@@ -21,6 +22,15 @@ log = logging.getLogger(__name__)
 
 Handler = Callable[[Any, str], Awaitable[msgspec.Struct]]
 
+SMALL: Final = 64 * 1024
+"""Longest body of most calls, in bytes: what is decoded at once must not hold up the rest."""
+
+MAX_INIT_BODY: Final = 4 * 2**20
+"""Longest body of ``/set-init``, in bytes."""
+
+MAX_QUERY_BODY: Final = 2**20
+"""Longest body of ``/query-ts``, in bytes."""
+
 _ENCODER = msgspec.json.Encoder()
 
 
@@ -31,18 +41,21 @@ def spooler_routes(api: SpoolerApi, bodies: BodyReader) -> list[Route]:
         api: does what is asked.
         bodies: reads the requests.
     """
-    calls: dict[str, tuple[type[msgspec.Struct], Handler]] = {
-        "/write-line": (words.WriteLineRequest, api.write_line),
-        "/get-ps": (words.GetPsRequest, api.get_ps),
-        "/status": (words.Empty, api.status),
-        "/cancel": (words.Empty, api.cancel),
-        "/set-init": (words.SetInitRequest, api.set_init),
-        "/get-init": (words.Empty, api.get_init),
-        "/add-job": (words.AddJobRequest, api.add_job),
-        "/list-jobs": (words.Empty, api.list_jobs),
-        "/query-ts": (words.QueryTsRequest, api.query_ts),
-    }
-    return [Route(path, Call(kind, handler, bodies)) for path, (kind, handler) in calls.items()]
+
+    def route(path: str, kind: type[msgspec.Struct], handler: Handler, most: int | None = SMALL) -> Route:
+        return Route(path, Call(kind, handler, bodies, most))
+
+    return [
+        route("/write-line", words.WriteLineRequest, api.write_line),
+        route("/get-ps", words.GetPsRequest, api.get_ps),
+        route("/status", words.Empty, api.status),
+        route("/cancel", words.Empty, api.cancel),
+        route("/set-init", words.SetInitRequest, api.set_init, MAX_INIT_BODY),
+        route("/get-init", words.Empty, api.get_init),
+        route("/add-job", words.AddJobRequest, api.add_job, None),
+        route("/list-jobs", words.Empty, api.list_jobs),
+        route("/query-ts", words.QueryTsRequest, api.query_ts, MAX_QUERY_BODY),
+    ]
 
 
 class Call:
@@ -52,12 +65,16 @@ class Call:
         kind: type of the request.
         handler: does what is asked.
         bodies: reads the requests.
+        most: longest body, in bytes; None for what the server takes.
     """
 
-    def __init__(self, kind: type[msgspec.Struct], handler: Handler, bodies: BodyReader) -> None:
+    def __init__(
+        self, kind: type[msgspec.Struct], handler: Handler, bodies: BodyReader, most: int | None
+    ) -> None:
         self._decoder = msgspec.json.Decoder(kind)
         self._handler = handler
         self._bodies = bodies
+        self._most = most
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request."""
@@ -65,7 +82,7 @@ class Call:
             await send_text(send, 400, f"invalid request: use POST for {scope['path']}")
             return
         try:
-            request = self._decode(await self._bodies.read(receive))
+            request = self._decode(await self._bodies.read(receive, self._most))
             answer = await self._handler(request, scope.get("toolpost.actor", ""))
         except InvalidRequestError as error:
             await send_text(send, 400, f"invalid request: {error}")
@@ -78,6 +95,8 @@ class Call:
         except ToolpostError as error:
             log.error("%s: %s", scope["path"], error)
             await send_text(send, 500, str(error))
+        except asyncio.CancelledError:
+            await send_text(send, 500, "the server is stopping")
         except Exception:
             log.exception("%s failed", scope["path"])
             await send_text(send, 500, "internal error; the server's log says more")
@@ -85,25 +104,15 @@ class Call:
             await send_answer(send, 200, _ENCODER.encode(answer) + b"\n", JSON)
 
     def _decode(self, body: bytes | bytearray) -> msgspec.Struct:
-        if not body.strip():
+        if not body or body.isspace():
             raise InvalidRequestError("the body is empty; send a JSON object")
-        if body.strip() == b"null":
+        if len(body) < SMALL and body.strip() == b"null":
             body = b"{}"
         try:
             return self._decoder.decode(body)
         except msgspec.ValidationError as error:
-            raise InvalidRequestError(_named(str(error))) from None
+            raise InvalidRequestError(words.name_the_field(str(error))) from None
         except (msgspec.DecodeError, UnicodeDecodeError) as error:
             raise InvalidRequestError(f"invalid JSON: {error}") from None
         except RecursionError:
             raise InvalidRequestError("invalid JSON: it is nested too deeply") from None
-
-
-def _named(message: str) -> str:
-    """Turn a message of msgspec's into one that begins with the field's name."""
-    text, _, path = message.partition(" - at `$")
-    field = path.rstrip("`").lstrip(".")
-    missing = text.removeprefix("Object missing required field `")
-    if missing != text:
-        return f"{missing.rstrip('`')}: must be given"
-    return f"{field}: {text[:1].lower()}{text[1:]}" if field else f"invalid JSON: {text}"

@@ -7,6 +7,16 @@ import msgspec
 from toolpost.core.report import Value
 
 
+def name_the_field(message: str) -> str:
+    """Turn a message of msgspec's into one that begins with the field's name."""
+    text, _, path = message.partition(" - at `$")
+    field = path.rstrip("`").lstrip(".")
+    missing = text.removeprefix("Object missing required field `")
+    if missing != text:
+        return f"{missing.rstrip('`')}: must be given"
+    return f"{field}: {text[:1].lower()}{text[1:]}" if field else f"invalid JSON: {text}"
+
+
 class Empty(msgspec.Struct):
     """``{}``: what several calls take and give."""
 
@@ -79,11 +89,11 @@ class GetInitAnswer(msgspec.Struct):
 
 
 class AddJobRequest(msgspec.Struct):
-    """A job; ``commands`` stays as it came, to be decoded in blocks. Newer clients say ``polls``."""
+    """A job. Its parts stay as they came: they may be large. Newer clients say ``polls`` for ``signals``."""
 
     commands: msgspec.Raw = msgspec.Raw(b"null")
-    signals: dict[str, float] | None = None
-    polls: dict[str, float] | None = None
+    signals: msgspec.Raw = msgspec.Raw(b"null")
+    polls: msgspec.Raw = msgspec.Raw(b"null")
 
 
 class AddJobAnswer(msgspec.Struct, omit_defaults=True):

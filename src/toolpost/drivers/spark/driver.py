@@ -26,6 +26,7 @@ log = logging.getLogger(__name__)
 
 _QUEUE_ANSWER = re.compile(rb"queue < cap:(\d{1,6}) num:(\d{1,6}) >")
 _QUEUE_FULL = "queue full"
+_STALL = 3 * HEARTBEAT
 _BACK_OFF_FIRST, _BACK_OFF_MOST = 0.1, 5.0
 
 
@@ -68,6 +69,7 @@ class SparkDriver:
         self._alive = False
         self._fault = False
         self._ticker: asyncio.TimerHandle | None = None
+        self._ticked_at = 0.0
 
     # The machine as seen from above.
 
@@ -132,17 +134,19 @@ class SparkDriver:
 
     async def execute(self, source: LineSource, signals: dict[str, float]) -> Ending:
         """Run a program to its end; the machine must be `ready`."""
-        if not self.ready:
+        if self._link is None or self._fault:
             return Ending(Outcome.FAILED, Reason.LINK_LOST, "the machine went away before the start")
         self._ending = self._loop.create_future()
         self._polls = Polls(signals, self._sender.send_now)
-        self._polls.start()
+        # Each of these may find the link broken, which ends the run at once.
         self._sender.run(source)
+        if self._polls is not None:
+            self._polls.start()
         try:
             return await self._ending
         finally:
             self._ending = None
-            self._sender.taken = 0
+            self._sender.end_run()
 
     def stop(self) -> None:
         """Stop the sender, drop what is unsent, then write ``!``; never the other way round."""
@@ -210,7 +214,8 @@ class SparkDriver:
         self._parser = PStateParser()
         self._connected_at = self._loop.time()
         self._silent_since = None
-        self._fault = self._link_gone = False
+        # A fault lasts until the power is cycled, which a boot tells, not a plug.
+        self._link_gone = False
         self._sender.attach(link)
         self._listener.session_started()
         self._listener.changed()
@@ -246,9 +251,9 @@ class SparkDriver:
         for line in arrived:
             answer = _QUEUE_ANSWER.fullmatch(line)
             if answer is not None:
-                capacity, num = int(answer[1]), int(answer[2])
-                self._listener.reported(Report(time_us, "queue", {"cap": capacity, "num": num}))
-                self._queue_answered(capacity, num)
+                queue: dict[str, Value] = {"cap": int(answer[1]), "num": int(answer[2])}
+                self._listener.reported(Report(time_us, "queue", queue))
+                self._queue_reported(queue)
             else:
                 self._line_received(content(line), time_us)
 
@@ -299,6 +304,7 @@ class SparkDriver:
         if working:
             # What was on its way when the core booted would be executed by the fresh one.
             self._sender.stop_owed = True
+        self._connected_at = self._loop.time()
         self._end_work(Ending(Outcome.FAILED, Reason.MACHINE_RESET, "the core has booted"))
         self._sender.reset()
         self._listener.session_started()
@@ -333,6 +339,11 @@ class SparkDriver:
             return
         self._ticker = self._loop.call_later(HEARTBEAT, self._tick)
         now = self._loop.time()
+        if now - self._ticked_at > _STALL:
+            # This process was not run for a while: what the core has said meanwhile is read after this.
+            self._sender.excuse(now)
+            self._silent_since = None
+        self._ticked_at = now
         if self._sender.overdue(now):
             self._silent(now)
         self._sender.beat(now)

@@ -78,7 +78,7 @@ class Flow:
 
     def retract(self, questions: int) -> None:
         """Note that the last questions were not written after all."""
-        for _ in range(questions):
+        for _ in range(min(questions, len(self._asked))):
             self._asked.pop()
         self._given_up = min(self._given_up, len(self._asked))
 

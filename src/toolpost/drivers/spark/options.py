@@ -12,7 +12,8 @@ class SparkOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     """Options of a machine with a Spark core; times in seconds.
 
     Attributes:
-        hold_off: no command is sent for so long after ``!``; newer firmware ignores them silently then.
+        hold_off: no command is sent for so long, and a tenth more, after the core has answered behind a
+            ``!``; newer firmware ignores them silently then.
         answer_timeout: without an answer to ``?queue`` for so long, the core counts as not alive.
         silence_limit: without an answer for so long, a running job is aborted and ``!`` is sent.
         stop_on_connect: send ``!`` whenever the link opens, so that nothing goes on from before.

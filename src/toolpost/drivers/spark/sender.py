@@ -23,6 +23,7 @@ _IDLE_ANSWERS = 2
 _MAX_WAITING = 100_000
 _MAX_UNWRITTEN = 65_536
 _PATIENCE_MOST = 10.0
+_HOLD_MARGIN = 1.1
 
 
 class Sender:
@@ -36,7 +37,7 @@ class Sender:
 
     Attributes:
         taken: commands of the present run that have been sent; 0 between two runs.
-        asked_at: when the last question was asked (loop time).
+        asked_at: since when an answer is awaited, or when the last one came (loop time).
         stop_owed: whether a stop has to be sent as soon as there is a link.
     """
 
@@ -62,7 +63,8 @@ class Sender:
         self._idle_answers = 0
         self._patience = options.answer_timeout
         self._executed_at = (0.0, 0)
-        self._hold: asyncio.TimerHandle | None = None
+        self._holding = False
+        self._hold_timer: asyncio.TimerHandle | None = None
         self._ask_timer: asyncio.TimerHandle | None = None
 
     @property
@@ -88,7 +90,7 @@ class Sender:
     @property
     def idle(self) -> bool:
         """Whether nothing is to be sent or executed, and no stop holds the next command back."""
-        return self._source is None and not self._direct and self._hold is None and self._flow.idle
+        return self._source is None and not self._direct and not self._holding and self._flow.idle
 
     @property
     def finished(self) -> bool:
@@ -108,7 +110,8 @@ class Sender:
     def detach(self) -> None:
         """The link is gone; what the core still held must be stopped when there is one again."""
         self._link = None
-        self.stop_owed = self._options.stop_on_connect or self._flow.outstanding > 0
+        if self._options.stop_on_connect or self._flow.outstanding > 0:
+            self.stop_owed = True
         self._flow.reset()
         self.close()
 
@@ -146,6 +149,11 @@ class Sender:
         self.pump()
         self._ask_if_none()
 
+    def end_run(self) -> None:
+        """Forget the source of a run that is over."""
+        self._source = None
+        self.taken = 0
+
     def drop(self) -> None:
         """Forget all commands that have not been sent."""
         self._direct.clear()
@@ -158,8 +166,11 @@ class Sender:
             return False
         text = line.decode("ascii")
         if text == lines.QUEUE:
-            self._ask()
+            # A question that is under way already is answered later than now, so it serves this one too.
+            self._ask_if_none()
         elif lines.is_queued(text):
+            if self._holding or self._flow.outstanding >= self._flow.capacity:
+                return False
             # Behind what is written already: an overtaken `?queue` would vouch for it too early.
             self._flow.sent += 1
             self._idle_answers = 0
@@ -176,18 +187,20 @@ class Sender:
         if link is None:
             self.stop_owed = True
             return
-        self.stop_owed = False
+        # Owed until the core has answered: the link may be lost before `!` is through.
+        self.stop_owed = True
         dropped = link.discard()
         link.write_now(_STOP)
         if dropped:
-            self._flow.retract(dropped.count(_ASK))
-            count = dropped.count(b"\n")
+            unsent = dropped.split(b"\n")
+            self._flow.retract(unsent.count(_ASK[:-1]))
+            count = len(unsent) - 1
             self._comm.note(f"{count} lines logged before were not written")
         self._comm.down(_STOP)
         self._flow.forget()
         self._idle_answers = 0
         self._end_hold()
-        self._hold = self._loop.call_later(self._options.hold_off, self._hold_over)
+        self._holding = True
         self._ask()
 
     def pump(self) -> None:
@@ -196,7 +209,7 @@ class Sender:
         if link is None or link.unwritten or not (self._direct or self._source is not None):
             return
         credit = flow.credit
-        if not credit or self._hold is not None:
+        if not credit or self._holding:
             return
         batch: list[bytes] = []
         while self._direct and len(batch) < credit:
@@ -233,11 +246,17 @@ class Sender:
         """Take an answer to ``?queue`` and send what it gives room for."""
         flow = self._flow
         now = self._loop.time()
+        asked_at, self.asked_at = self.asked_at, now
         if not flow.answer(capacity, num):
             self._ask_if_none()
             return
+        self.stop_owed = False
+        if self._holding and self._hold_timer is None:
+            # The core's own hold-off began when `!` arrived, and this answer is the first word of that.
+            hold_off = self._options.hold_off * _HOLD_MARGIN
+            self._hold_timer = self._loop.call_later(hold_off, self._hold_over)
         # A core that always answers late must not be given up again and again.
-        self._patience = max(self._options.answer_timeout, 2 * (now - self.asked_at))
+        self._patience = max(self._options.answer_timeout, 2 * (now - asked_at))
         self._idle_answers = self._idle_answers + 1 if flow.idle else 0
         self.pump()
         if not flow.asking and not self.finished:
@@ -256,12 +275,17 @@ class Sender:
         if now - self.asked_at >= HEARTBEAT * 0.9 and not self._flow.asking:
             self._ask()
 
+    def excuse(self, now: float) -> None:
+        """Count the time to the next answer from now."""
+        self.asked_at = now
+
     def overdue(self, now: float) -> bool:
         """Whether the last question has not been answered in time."""
         return self._flow.asking and now - self.asked_at > self._options.answer_timeout
 
     def _ask(self) -> None:
-        self.asked_at = self._loop.time()
+        if not self._flow.asking:
+            self.asked_at = self._loop.time()
         self._flow.ask()
         self._write(_ASK)
 
@@ -302,6 +326,7 @@ class Sender:
         self._free()
 
     def _end_hold(self) -> None:
-        if self._hold is not None:
-            self._hold.cancel()
-            self._hold = None
+        self._holding = False
+        if self._hold_timer is not None:
+            self._hold_timer.cancel()
+            self._hold_timer = None
