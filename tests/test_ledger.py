@@ -6,6 +6,7 @@ import threading
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import msgspec
 import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
@@ -44,6 +45,22 @@ class Desk:
     def stored(self):
         """What another process would find."""
         return {job.seq: job for job in JobStore(self.database).load("m", 1000)}
+
+    def new(self, *names):
+        """New jobs that are to wait in the queue."""
+        return [self.ledger.new(PROGRAM, {}, name=name, called=False) for name in names]
+
+    async def add(self, signals=None, **values):
+        """Add one job and return it as it is then."""
+        job = self.ledger.new(PROGRAM, signals or {}, **values)
+        await self.ledger.add([job], "me")
+        return self.ledger.get(job.seq)
+
+    async def queue(self, *names):
+        """Add jobs to the queue and return them."""
+        jobs = self.new(*names)
+        await self.ledger.add(jobs, "me")
+        return jobs
 
     async def settle(self):
         """Let all that is queued be written and told."""
@@ -84,6 +101,10 @@ def ended(job, detail=""):
     return job.to(S.CANCELED, Reason.CANCELED_BY_USER, 9, detail)
 
 
+def moved(job, **values):
+    return msgspec.structs.replace(job, **values)
+
+
 async def until(condition):
     async with asyncio.timeout(10):
         while not condition():
@@ -96,7 +117,7 @@ async def until(condition):
 def test_an_added_job_is_on_disk_and_told(path):
     async def main():
         with Desk(path) as desk:
-            job = await desk.ledger.add(PROGRAM, {"?pos": 0.5}, "me")
+            job = await desk.add({"?pos": 0.5})
             assert desk.stored() == {1: job}
             assert (job.state, job.program, job.commands, job.signals) == (
                 S.PENDING,
@@ -116,7 +137,7 @@ def test_a_job_not_on_disk_yet_is_not_shown_and_not_started_but_holds_its_place(
     async def main():
         with Desk(path) as desk:
             let_go = desk.hold()
-            adding = asyncio.create_task(desk.ledger.add(PROGRAM, {}, "me"))
+            adding = asyncio.create_task(desk.add())
             await asyncio.sleep(0)
             assert list(desk.ledger) == []
             assert desk.ledger.next is None
@@ -130,7 +151,7 @@ def test_a_job_not_on_disk_yet_is_not_shown_and_not_started_but_holds_its_place(
 def test_ids_differ_and_order_is_that_of_adding(path):
     async def main():
         with Desk(path) as desk:
-            jobs = await asyncio.gather(*(desk.ledger.add(PROGRAM, {}, "me") for _ in range(20)))
+            jobs = await asyncio.gather(*(desk.add() for _ in range(20)))
             assert len({job.id for job in jobs}) == 20
             assert [job.seq for job in desk.ledger] == list(range(1, 21))
 
@@ -142,11 +163,11 @@ def test_a_job_the_disk_did_not_take_is_not_there(path):
         with Desk(path) as desk:
             await fill(desk.database)
             with pytest.raises(StorageError):
-                await desk.ledger.add(PROGRAM, HUGE, "me")
+                await desk.add(HUGE)
             assert list(desk.ledger) == desk.ledger.open == desk.told == []
             assert desk.ledger.next is None
             await free(desk.database)
-            job = await desk.ledger.add(PROGRAM, {}, "me")
+            job = await desk.add()
             assert job.seq == 2, "a number is not used again"
 
     run(main)
@@ -156,7 +177,7 @@ def test_who_added_may_go_away(path):
     async def main():
         with Desk(path) as desk:
             let_go = desk.hold()
-            adding = asyncio.create_task(desk.ledger.add(PROGRAM, {}, "me"))
+            adding = asyncio.create_task(desk.add())
             await asyncio.sleep(0)
             adding.cancel()
             await asyncio.gather(adding, return_exceptions=True)
@@ -173,7 +194,7 @@ def test_who_added_may_go_away_while_the_disk_is_full(path):
         with Desk(path) as desk:
             await fill(desk.database)
             let_go = desk.hold()
-            adding = asyncio.create_task(desk.ledger.add(PROGRAM, HUGE, "me"))
+            adding = asyncio.create_task(desk.add(HUGE))
             await asyncio.sleep(0)
             adding.cancel()
             await asyncio.gather(adding, return_exceptions=True)
@@ -188,9 +209,9 @@ def test_a_job_canceled_while_it_is_being_added(path):
     async def main():
         with Desk(path) as desk:
             let_go = desk.hold()
-            adding = asyncio.create_task(desk.ledger.add(PROGRAM, {}, "me"))
+            adding = asyncio.create_task(desk.add())
             await asyncio.sleep(0)
-            records = desk.ledger.end_all(S.CANCELED, Reason.CANCELED_BY_USER, "you")
+            records = desk.ledger.end_called(S.CANCELED, Reason.CANCELED_BY_USER, "you")
             let_go()
             job = await adding
             await asyncio.gather(*records)
@@ -207,7 +228,7 @@ def test_a_job_canceled_while_it_is_being_added(path):
 def test_a_change_holds_at_once_and_is_on_disk_when_it_returns(path):
     async def main():
         with Desk(path) as desk:
-            job = started(await desk.ledger.add(PROGRAM, {}, "me"))
+            job = started(await desk.add())
             changing = asyncio.create_task(desk.ledger.change(job))
             await asyncio.sleep(0)
             assert desk.ledger.active is job
@@ -222,7 +243,7 @@ def test_a_change_holds_at_once_and_is_on_disk_when_it_returns(path):
 def test_a_change_the_disk_did_not_take_is_undone(path):
     async def main():
         with Desk(path) as desk:
-            job = await desk.ledger.add(PROGRAM, {}, "me")
+            job = await desk.add()
             await fill(desk.database)
             with pytest.raises(StorageError):
                 await desk.ledger.change(job.to(S.PROCESSING, Reason.RUNNING, 5, LONG))
@@ -237,7 +258,7 @@ def test_a_change_the_disk_did_not_take_is_undone(path):
 def test_a_change_undone_does_not_undo_what_came_after_it(path):
     async def main():
         with Desk(path) as desk:
-            job = await desk.ledger.add(PROGRAM, {}, "me")
+            job = await desk.add()
             await fill(desk.database)
             let_go = desk.hold()
             start = job.to(S.PROCESSING, Reason.RUNNING, 5, LONG)
@@ -259,7 +280,7 @@ def test_a_change_undone_does_not_undo_what_came_after_it(path):
 def test_what_is_declared_holds_at_once(path):
     async def main():
         with Desk(path) as desk:
-            job = ended(await desk.ledger.add(PROGRAM, {}, "me"))
+            job = ended(await desk.add())
             future = desk.ledger.declare(job, "me")
             assert desk.ledger.get(1) is job
             assert desk.ledger.open == []
@@ -274,7 +295,7 @@ def test_what_is_declared_holds_at_once(path):
 def test_what_is_declared_is_written_again_until_the_disk_takes_it(path):
     async def main():
         with Desk(path) as desk:
-            job = ended(await desk.ledger.add(PROGRAM, {}, "me"), LONG)
+            job = ended(await desk.add(), LONG)
             await fill(desk.database)
             with pytest.raises(StorageError):
                 await desk.ledger.declare(job)
@@ -294,12 +315,12 @@ def test_what_is_owed_is_written_before_what_comes_later(path, monkeypatch):
 
     async def main():
         with Desk(path) as desk:
-            job = ended(await desk.ledger.add(PROGRAM, {}, "me"), LONG)
+            job = ended(await desk.add(), LONG)
             await fill(desk.database)
             with pytest.raises(StorageError):
                 await desk.ledger.declare(job)
             await free(desk.database)
-            second = await desk.ledger.add(PROGRAM, {}, "me")
+            second = await desk.add()
             assert desk.stored() == {1: job, 2: second}
 
     run(main)
@@ -308,7 +329,7 @@ def test_what_is_owed_is_written_before_what_comes_later(path, monkeypatch):
 def test_a_late_retry_does_not_undo_a_later_transition(path):
     async def main():
         with Desk(path) as desk:
-            job = started(await desk.ledger.add(PROGRAM, {}, "me"))
+            job = started(await desk.add())
             await desk.ledger.change(job)
             await fill(desk.database)
             stopped = job.to(S.PROCESSING_STOPPED, Reason.LINK_LOST, 6, LONG)
@@ -331,19 +352,267 @@ def test_a_late_retry_does_not_undo_a_later_transition(path):
     run(main)
 
 
-def test_end_all_ends_all_that_have_not_ended(path):
+def test_end_called_ends_all_that_have_not_ended_but_what_waits_in_the_queue(path):
     async def main():
         with Desk(path) as desk:
-            jobs = [await desk.ledger.add(PROGRAM, {}, "me") for _ in range(4)]
+            jobs = [await desk.add() for _ in range(4)]
             await desk.ledger.change(started(jobs[0]))
             await desk.ledger.change(jobs[1].to(S.PENDING_HELD, Reason.MACHINE_BUSY, 3))
             await desk.ledger.declare(jobs[2].to(S.ABORTED, Reason.PROGRAM_MISSING, 3))
-            futures = desk.ledger.end_all(S.CANCELED, Reason.CANCELED_BY_USER, "you")
+            queued = await desk.queue("a", "b")
+            futures = desk.ledger.end_called(S.CANCELED, Reason.CANCELED_BY_USER, "you")
             assert len(futures) == 3
             await asyncio.gather(*futures)
             states = [job.state for job in desk.stored().values()]
-            assert states == [S.CANCELED, S.CANCELED, S.ABORTED, S.CANCELED]
-            assert desk.ledger.open == []
+            assert states == [S.CANCELED, S.CANCELED, S.ABORTED, S.CANCELED, S.PENDING, S.PENDING]
+            assert desk.ledger.called == []
+            assert desk.ledger.open == desk.ledger.queued == queued
+
+    run(main)
+
+
+# The queue.
+
+
+def test_queued_jobs_wait_in_order_and_do_not_start(path):
+    async def main():
+        with Desk(path) as desk:
+            jobs = await desk.queue("a", "b", "a")
+            assert desk.ledger.queued == desk.told == jobs
+            assert [(job.name, job.called, job.reason) for job in jobs] == [
+                (name, False, Reason.QUEUE_POSITION) for name in "aba"
+            ]
+            assert desk.ledger.called == []
+            assert desk.ledger.next is None
+            assert list(desk.stored().values()) == jobs
+            other = await desk.add()
+            assert desk.ledger.queued == jobs, "a job that is called does not wait in the queue"
+            assert desk.ledger.called == [other]
+            assert desk.ledger.next is other
+            assert desk.ledger.open == [*jobs, other]
+
+    run(main)
+
+
+def test_queued_is_ordered_by_position_then_by_adding(path):
+    async def main():
+        with Desk(path) as desk:
+            positions = [7, -3, 7, 0]
+            jobs = [
+                moved(job, position=position)
+                for job, position in zip(desk.new(*"abcd"), positions, strict=True)
+            ]
+            await desk.ledger.add(jobs, "me")
+            assert [job.name for job in desk.ledger.queued] == ["b", "d", "a", "c"]
+        with Desk(path) as desk:
+            assert [job.name for job in desk.ledger.queued] == ["b", "d", "a", "c"]
+            assert [job.name for job in desk.ledger] == ["a", "b", "c", "d"]
+
+    run(main)
+
+
+def test_a_jump_is_a_change_of_position_and_leaves_room(path):
+    async def main():
+        with Desk(path) as desk:
+            await desk.queue("a", "b", "c")
+            for name in ("c", "b", "a", "c"):
+                queued = desk.ledger.queued
+                job = next(job for job in queued if job.name == name)
+                await desk.ledger.change(moved(job, position=queued[0].position - 1), actor="me")
+                assert desk.ledger.queued[0].name == name
+            await desk.queue("d")
+            assert [job.name for job in desk.ledger.queued] == ["c", "a", "b", "d"]
+        with Desk(path) as desk:
+            assert [job.name for job in desk.ledger.queued] == ["c", "a", "b", "d"]
+
+    run(main)
+
+
+def test_what_is_not_on_disk_yet_is_left_out_of_the_queue(path):
+    async def main():
+        with Desk(path) as desk:
+            first = await desk.queue("a")
+            assert desk.ledger.queued == first
+            let_go = desk.hold()
+            jobs = desk.new("b", "c")
+            adding = asyncio.create_task(desk.ledger.add(jobs, "me"))
+            await asyncio.sleep(0)
+            assert desk.ledger.queued == first
+            assert desk.ledger.open == [*first, *jobs]
+            let_go()
+            await adding
+            assert desk.ledger.queued == [*first, *jobs]
+
+    run(main)
+
+
+def test_queued_is_right_after_each_kind_of_change(path):
+    async def main():
+        with Desk(path) as desk:
+            ledger = desk.ledger
+
+            def names():
+                return "".join(job.name for job in ledger.queued)
+
+            assert names() == ""
+            a, b, c, d, e = await desk.queue(*"abcde")
+            assert names() == "abcde"
+
+            let_go = desk.hold()
+            calling = asyncio.create_task(ledger.change(moved(a, called=True)))
+            await asyncio.sleep(0)
+            assert names() == "bcde", "a change holds at once"
+            let_go()
+            await calling
+            assert names() == "bcde"
+            await ledger.change(moved(a, called=False))
+            assert names() == "abcde"
+            await ledger.change(moved(e, position=a.position - 1))
+            assert names() == "eabcd"
+            future = ledger.declare(ended(b))
+            assert names() == "eacd"
+            await future
+            ledger.explain(c, Reason.MACHINE_OFFLINE)
+            assert [job.reason for job in ledger.queued if job.name == "c"] == [Reason.MACHINE_OFFLINE]
+            await ledger.change(ended(c), moved(d, position=e.position))
+            assert names() == "ead"
+
+            before = ledger.queued
+            await fill(desk.database)
+            with pytest.raises(StorageError):
+                await ledger.change(ended(a), ended(d, LONG))
+            assert ledger.queued == before, "a change undone"
+            with pytest.raises(StorageError):
+                await ledger.add([moved(job, detail=LONG) for job in desk.new("f", "g")], "me")
+            assert ledger.queued == before, "an addition undone"
+
+    run(main)
+
+
+def test_jobs_changed_together_are_changed_and_told_together(path):
+    async def main():
+        with Desk(path) as desk:
+            a, b, c = await desk.queue(*"abc")
+            changed = [moved(c, position=1), moved(a, position=2), ended(b)]
+            desk.told.clear()
+            await desk.ledger.change(*changed, actor="you")
+            assert desk.told == changed
+            assert [job.name for job in desk.ledger.queued] == ["c", "a"]
+            assert list(desk.stored().values()) == [changed[1], changed[2], changed[0]]
+
+    run(main)
+
+
+def test_many_jobs_added_in_one_call_are_all_there_after_a_restart(path):
+    count = 10_000
+
+    async def main():
+        with Desk(path, keep_shown=10, keep_stored=10) as desk:
+            jobs = await desk.queue(*(f"{n:05}" for n in range(count)))
+            assert len({job.id for job in jobs}) == count
+            assert desk.ledger.queued == desk.told == jobs
+        with Desk(path, keep_shown=10, keep_stored=10) as desk:
+            assert desk.ledger.queued == list(desk.ledger) == jobs
+            await desk.settle()
+            assert desk.told == [], "they are as they were"
+            assert len(desk.stored()) == count, "not trimmed: they have not ended"
+
+    run(main)
+
+
+@pytest.mark.parametrize("canceled", [False, True])
+def test_many_jobs_that_the_disk_does_not_take_are_not_there(path, canceled):
+    async def main():
+        with Desk(path) as desk:
+            first = await desk.queue("a")
+            await fill(desk.database)
+            jobs = desk.new(*(f"{n:05}" for n in range(2000)))
+            adding = asyncio.create_task(desk.ledger.add(jobs, "me"))
+            await asyncio.sleep(0)
+            if canceled:
+                adding.cancel()
+            results = await asyncio.gather(adding, return_exceptions=True)
+            assert isinstance(results[0], asyncio.CancelledError if canceled else StorageError)
+            await desk.settle()
+            assert desk.ledger.queued == desk.ledger.open == list(desk.ledger) == desk.told == first
+            await free(desk.database)
+            last = await desk.queue("z")
+            assert last[0].seq == 2002
+        with Desk(path) as desk:
+            assert desk.ledger.queued == first + last
+
+    run(main)
+
+
+def test_many_removed_at_once_of_which_few_are_shown_are_back_if_the_disk_does_not_take_it(path):
+    async def main():
+        with Desk(path, keep_shown=3) as desk:
+            jobs = await desk.queue(*(f"{n:05}" for n in range(500)))
+            await fill(desk.database)
+            with pytest.raises(StorageError):
+                await desk.ledger.change(*(ended(job, LONG) for job in jobs))
+            assert desk.ledger.queued == list(desk.ledger) == jobs
+            await free(desk.database)
+            await desk.ledger.change(*(ended(job) for job in jobs))
+            assert desk.ledger.queued == []
+            assert [job.seq for job in desk.ledger] == [498, 499, 500]
+
+    run(main)
+
+
+def test_ends_that_may_be_undone_are_not_forgotten_for_another(path):
+    async def main():
+        with Desk(path, keep_shown=0) as desk:
+            jobs = await desk.queue("a", "b")
+            await fill(desk.database)
+            let_go = desk.hold()
+            changing = asyncio.create_task(desk.ledger.change(ended(jobs[0], LONG)))
+            await asyncio.sleep(0)
+            done = desk.ledger.declare(ended(jobs[1]))
+            let_go()
+            await asyncio.gather(changing, done, return_exceptions=True)
+            assert isinstance(changing.exception(), StorageError)
+            assert desk.ledger.queued == [jobs[0]]
+
+    run(main)
+
+
+@pytest.mark.parametrize("full", [False, True])
+def test_who_changed_may_go_away(path, full):
+    async def main():
+        with Desk(path) as desk:
+            (job,) = await desk.queue("a")
+            if full:
+                await fill(desk.database)
+            let_go = desk.hold()
+            gone = ended(job, LONG)
+            changing = asyncio.create_task(desk.ledger.change(gone, actor="me"))
+            await asyncio.sleep(0)
+            changing.cancel()
+            await asyncio.gather(changing, return_exceptions=True)
+            let_go()
+            await desk.settle()
+            assert desk.ledger.get(1) is (job if full else gone)
+            assert desk.told == ([job] if full else [job, gone])
+            assert desk.stored() == {1: desk.ledger.get(1)}
+
+    run(main)
+
+
+def test_a_job_does_not_start_before_its_call_is_on_disk(path):
+    async def main():
+        with Desk(path) as desk:
+            (job,) = await desk.queue("a")
+            call = moved(job, called=True, reason=Reason.MACHINE_BUSY)
+            let_go = desk.hold()
+            calling = asyncio.create_task(desk.ledger.change(call))
+            await asyncio.sleep(0)
+            assert desk.ledger.called == [call]
+            assert desk.ledger.next is None
+            let_go()
+            await calling
+            assert desk.ledger.next is call
+            assert call in desk.told
 
     run(main)
 
@@ -356,7 +625,7 @@ def test_load_after_a_crash(path, load_on_startup, pending):
     async def main():
         with Desk(path) as desk:
             for _ in range(3):
-                await desk.ledger.add(PROGRAM, {}, "me")
+                await desk.add()
             await desk.ledger.declare(ended(desk.ledger.get(1)))
             await desk.ledger.change(started(desk.ledger.get(2)))
         with Desk(path, load_on_startup=load_on_startup) as desk:
@@ -366,8 +635,26 @@ def test_load_after_a_crash(path, load_on_startup, pending):
             await desk.settle()
             assert list(desk.stored().values()) == list(desk.ledger)
             assert len(desk.told) == (1 if load_on_startup else 2)
-            job = await desk.ledger.add(PROGRAM, {}, "me")
+            job = await desk.add()
             assert job.seq == 4
+
+    run(main)
+
+
+@pytest.mark.parametrize("load_on_startup", [True, False])
+def test_load_puts_a_called_job_back_into_the_queue(path, load_on_startup):
+    async def main():
+        with Desk(path) as desk:
+            jobs = await desk.queue("a", "b")
+            await desk.ledger.change(moved(jobs[0], called=True, reason=Reason.MACHINE_BUSY))
+            assert desk.ledger.queued == jobs[1:]
+        with Desk(path, load_on_startup=load_on_startup) as desk:
+            assert desk.ledger.queued == jobs
+            assert desk.ledger.called == []
+            assert desk.ledger.next is None
+            await desk.settle()
+            assert desk.told == jobs[:1]
+            assert list(desk.stored().values()) == jobs
 
     run(main)
 
@@ -376,7 +663,7 @@ def test_load_trims_the_store(path):
     async def main():
         with Desk(path) as desk:
             for _ in range(10):
-                await desk.ledger.declare(ended(await desk.ledger.add(PROGRAM, {}, "me")))
+                await desk.ledger.declare(ended(await desk.add()))
         with Desk(path, keep_stored=4) as desk:
             await desk.settle()
             assert list(desk.stored()) == [7, 8, 9, 10]
@@ -387,9 +674,9 @@ def test_load_trims_the_store(path):
 def test_ended_jobs_shown_are_bounded_and_open_ones_never_left_out(path):
     async def main():
         with Desk(path, keep_shown=3) as desk:
-            held = await desk.ledger.add(PROGRAM, {}, "me")
+            held = await desk.add()
             for _ in range(10):
-                await desk.ledger.declare(ended(await desk.ledger.add(PROGRAM, {}, "me")))
+                await desk.ledger.declare(ended(await desk.add()))
             assert [job.seq for job in desk.ledger] == [held.seq, 9, 10, 11]
             assert len(desk.ledger._jobs) == 4
             assert len(desk.stored()) == 11
@@ -402,7 +689,7 @@ def test_ended_jobs_shown_are_bounded_and_open_ones_never_left_out(path):
 def test_close_gives_up_what_the_disk_did_not_take(path):
     async def main():
         with Desk(path) as desk:
-            job = ended(await desk.ledger.add(PROGRAM, {}, "me"), LONG)
+            job = ended(await desk.add(), LONG)
             await fill(desk.database)
             with pytest.raises(StorageError):
                 await desk.ledger.declare(job)
@@ -450,30 +737,56 @@ class Life(RuleBasedStateMachine):
     def add(self, signals):
         async def adding():
             with contextlib.suppress(StorageError):
-                job = await self.desk.ledger.add(PROGRAM, signals, "me")
+                job = await self.desk.add(signals)
                 assert job.seq not in self.seen
                 self.seen.add(job.seq)
                 self.expected[job.seq] = job
 
         self.run(adding())
 
+    @rule(names=st.lists(st.sampled_from("ab"), max_size=4), detail=st.sampled_from(["", LONG]))
+    def queue(self, names, detail):
+        async def queueing():
+            jobs = [moved(job, detail=detail) for job in self.desk.new(*names)]
+            with contextlib.suppress(StorageError):
+                await self.desk.ledger.add(jobs, "me")
+                assert self.seen.isdisjoint(job.seq for job in jobs)
+                self.seen.update(job.seq for job in jobs)
+                self.expected |= {job.seq: job for job in jobs}
+
+        self.run(queueing())
+
+    async def changing(self, *after):
+        before = [self.desk.ledger.get(job.seq) for job in after]
+        try:
+            await self.desk.ledger.change(*after)
+        except StorageError:
+            for job in before:
+                assert self.desk.ledger.get(job.seq) is job
+        else:
+            for job in after:
+                self.expected[job.seq] = job
+                self.owed.pop(job.seq, None)
+
     @rule(data=st.data(), detail=st.sampled_from(["", LONG]))
     def change(self, data, detail):
         job = self.job(data, S.PENDING, S.PROCESSING_STOPPED)
         if job is None or self.desk.ledger.active not in (None, job):
             return
+        self.run(self.changing(job.to(S.PROCESSING, Reason.RUNNING, 5, detail)))
 
-        async def changing():
-            after = job.to(S.PROCESSING, Reason.RUNNING, 5, detail)
-            try:
-                await self.desk.ledger.change(after)
-            except StorageError:
-                assert self.desk.ledger.get(job.seq) is job
-            else:
-                self.expected[job.seq] = after
-                self.owed.pop(job.seq, None)
+    @rule(data=st.data(), detail=st.sampled_from(["", LONG]), called=st.booleans())
+    def call_or_put_back(self, data, detail, called):
+        job = self.job(data, S.PENDING)
+        if job is not None and job.name:
+            self.run(self.changing(moved(job, called=called, detail=detail)))
 
-        self.run(changing())
+    @rule(data=st.data(), detail=st.sampled_from(["", LONG]), removed=st.integers(0, 2))
+    def rearrange(self, data, detail, removed):
+        order = data.draw(st.permutations(self.desk.ledger.queued))
+        after = [ended(job, detail) for job in order[:removed]]
+        after += [moved(job, position=place, detail=detail) for place, job in enumerate(order[removed:])]
+        self.run(self.changing(*after))
 
     @rule(data=st.data(), detail=st.sampled_from(["", LONG]))
     def declare(self, data, detail):
@@ -530,7 +843,9 @@ class Life(RuleBasedStateMachine):
                 self.expected[seq] = found[seq]
             elif job.state is S.PROCESSING:
                 assert (found[seq].state, found[seq].reason) == (S.PROCESSING_STOPPED, Reason.HOST_RESTARTED)
-            elif job.state is S.PENDING and not self.load_on_startup:
+            elif job.state is S.PENDING and job.called and job.name:
+                assert found[seq] == moved(job, called=False, reason=Reason.QUEUE_POSITION)
+            elif job.state is S.PENDING and job.called and not self.load_on_startup:
                 assert (found[seq].state, found[seq].reason) == (S.PENDING_HELD, Reason.HOST_RESTARTED)
             else:
                 assert found[seq] == job
@@ -548,6 +863,14 @@ class Life(RuleBasedStateMachine):
         assert {job.seq: job for job in self.desk.ledger} == self.expected | self.owed
         assert {job.seq for job in self.desk.ledger.open} == {
             job.seq for job in self.desk.ledger if not job.ended
+        }
+
+    @invariant()
+    def the_queue_is_what_waits_in_order(self):
+        waiting = [job for job in self.desk.ledger if job.state is S.PENDING and not job.called]
+        assert self.desk.ledger.queued == sorted(waiting, key=lambda job: (job.position, job.seq))
+        assert {job.seq for job in self.desk.ledger.called} == {
+            job.seq for job in self.desk.ledger.open if job not in waiting
         }
 
     def teardown(self):

@@ -12,16 +12,18 @@ from starlette.routing import BaseRoute, Mount, Router
 
 from toolpost.commlog import CommLog
 from toolpost.config import Address, Config, machine_addresses, main_addresses, without_effect
+from toolpost.dialects.moonraker.app import Moonraker, takes_forms
 from toolpost.dialects.spooler.api import SpoolerApi
 from toolpost.dialects.spooler.routes import spooler_routes
 from toolpost.errors import StartError, StorageError
-from toolpost.events import Events
+from toolpost.events import Events, FileChanged
 from toolpost.http.body import BodyReader
 from toolpost.http.gate import Gate
 from toolpost.http.server import Listener, is_loopback
 from toolpost.machine import Machine
 from toolpost.shop import Shop
 from toolpost.store import Store
+from toolpost.store.files import Files
 from toolpost.store.lock import DirectoryLock
 from toolpost.telemetry import Telemetry
 
@@ -87,9 +89,17 @@ class App:
             comm = CommLog(self._data / "logs", name, config.log)
             opened.callback(comm.close)
             machines[name] = Machine(name, config, store, telemetry, comm, events)
-        shop = Shop(machines, store, telemetry, self._config.storage.programs_bytes)
+        files = Files(
+            self._data / "gcodes",
+            self._data / "programs" / "files",
+            on_change=lambda change: events.publish(FileChanged(change)),
+        )
+        shop = Shop(machines, store, telemetry, files, self._config.storage.programs_bytes)
+        moonrakers = {name: Moonraker(shop, name, events) for name in machines}
+        for moonraker in moonrakers.values():
+            opened.callback(moonraker.close)
         listeners = []
-        for address, roots in self._addresses(shop):
+        for address, roots in self._addresses(shop, moonrakers):
             listener = self._listener(address, roots, store)
             opened.callback(listener.release)
             listeners.append(listener)
@@ -98,14 +108,17 @@ class App:
         opened.push_async_callback(_halt_all, list(machines.values()))
         return list(machines.values()), listeners
 
-    def _addresses(self, shop: Shop) -> Iterator[tuple[Address, list[BaseRoute]]]:
+    def _addresses(
+        self, shop: Shop, moonrakers: dict[str, Moonraker]
+    ) -> Iterator[tuple[Address, list[BaseRoute]]]:
         """Yield where is listened and what is served there."""
         server = self._config.server
         bodies = BodyReader(server.max_body_bytes, server.max_body_bytes * _BODIES_AT_ONCE)
 
         def routes(name: str) -> list[BaseRoute]:
             failed = self._config.machines[name].spooler.failed
-            return list(spooler_routes(SpoolerApi(shop, name, failed), bodies))
+            spooler = spooler_routes(SpoolerApi(shop, name, failed), bodies)
+            return [*spooler, *moonrakers[name].routes(bodies)]
 
         main = routes(shop.machines[0])
         main += [Mount(f"/machines/{name}", routes=routes(name)) for name in shop.machines]
@@ -119,7 +132,7 @@ class App:
         server = self._config.server
         local = is_loopback(address)
         router = Router(roots, redirect_slashes=False)
-        gate = Gate(router, server, local=local, key_owner=store.keys.owner)
+        gate = Gate(router, server, local=local, key_owner=store.keys.owner, takes_forms=takes_forms)
         listener = Listener(address, gate, server.max_connections)
         if not local:
             self._warn_of_exposure(listener.url, store)

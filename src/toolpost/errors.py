@@ -23,6 +23,18 @@ class InvalidLineError(InvalidRequestError):
         self.problem = problem
 
 
+class FileMissingError(ToolpostError):
+    """There is no such file or directory.
+
+    Args:
+        name: what was asked for.
+    """
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"{name[:200]!r} does not exist")
+        self.name = name
+
+
 class NotAcceptedError(ToolpostError):
     """The request is well formed, but the machine's present state does not allow it."""
 

@@ -1,5 +1,6 @@
 """What happens in the shop, told to whoever wants to know."""
 
+import enum
 from collections.abc import Callable
 from typing import TypeAlias
 
@@ -8,6 +9,16 @@ import msgspec
 from toolpost.core.job import Job
 from toolpost.core.machine import MachineState
 from toolpost.core.report import Report
+from toolpost.gcode.entries import Change
+
+
+class QueueAction(enum.StrEnum):
+    """What has happened to a queue (Moonraker, notify_job_queue_changed)."""
+
+    STATE_CHANGED = "state_changed"
+    JOBS_ADDED = "jobs_added"
+    JOBS_REMOVED = "jobs_removed"
+    JOB_LOADED = "job_loaded"
 
 
 class JobChanged(msgspec.Struct, frozen=True, tag=True):
@@ -30,7 +41,21 @@ class Reported(msgspec.Struct, frozen=True, tag=True):
     report: Report
 
 
-Event: TypeAlias = JobChanged | MachineChanged | Reported
+class QueueChanged(msgspec.Struct, frozen=True, tag=True):
+    """The queue of a machine has changed, and that is on disk; `listed` if its jobs or their order have."""
+
+    machine: str
+    action: QueueAction
+    listed: bool = True
+
+
+class FileChanged(msgspec.Struct, frozen=True, tag=True):
+    """Something in the ``gcodes`` root has changed, and that is on disk."""
+
+    change: Change
+
+
+Event: TypeAlias = FileChanged | JobChanged | MachineChanged | QueueChanged | Reported
 
 
 class Events:

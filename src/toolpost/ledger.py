@@ -8,8 +8,9 @@ whether the disk takes it or not: it is written again until it is.
 import asyncio
 import logging
 import secrets
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from itertools import islice
 
 import msgspec
 
@@ -17,7 +18,6 @@ from toolpost.clock import now_us
 from toolpost.core.job import Job, JobState, Reason, after_restart
 from toolpost.core.program import Program
 from toolpost.core.queue import active, next_to_start
-from toolpost.errors import StorageError
 from toolpost.store.jobs import JobStore
 
 log = logging.getLogger(__name__)
@@ -27,6 +27,7 @@ SYSTEM = "system"
 
 _RETRY_AFTER = 1.0
 _TRIM_EVERY = 100
+_POSITION_STEP = 1 << 20
 
 
 class Ledger:
@@ -57,6 +58,9 @@ class Ledger:
         self._jobs: dict[int, Job] = {}
         self._unsaved: set[int] = set()
         self._open: dict[int, Job] = {}
+        self._called: dict[int, Job] = {}
+        self._queued: list[Job] | None = None
+        self._changing: dict[int, Job] = {}
         self._debts: dict[int, tuple[Job, str]] = {}
         self._retry: asyncio.TimerHandle | None = None
 
@@ -83,59 +87,77 @@ class Ledger:
         return list(self._open.values())
 
     @property
+    def called(self) -> list[Job]:
+        """The jobs that have not ended and do not just wait in the queue."""
+        return list(self._called.values())
+
+    @property
+    def queued(self) -> list[Job]:
+        """The jobs that wait in the queue, in order; those not on disk yet are left out."""
+        if self._queued is None:
+            waiting = [job for job in self._open.values() if _is_queued(job) and job.seq not in self._unsaved]
+            self._queued = sorted(waiting, key=lambda job: (job.position, job.seq))
+        return self._queued
+
+    @property
     def active(self) -> Job | None:
         """The job that holds the machine."""
-        return active(self._open.values())
+        return active(self._called.values())
 
     @property
     def next(self) -> Job | None:
-        """The job to start once the machine is ready."""
-        job = next_to_start(self._open.values())
-        return None if job is None or job.seq in self._unsaved else job
+        """The job to start once the machine is ready; none before it, or its call, is on disk."""
+        job = next_to_start(self._called.values())
+        return None if job is None or job.seq in self._unsaved or job.seq in self._changing else job
 
-    async def add(self, program: Program, signals: dict[str, float], actor: str) -> Job:
-        """Add a job at the end of the queue; it is on disk when this returns.
-
-        Raises:
-            StorageError: it could not be stored, and there is no such job.
-        """
+    def new(self, program: Program, signals: dict[str, float], *, name: str = "", called: bool = True) -> Job:
+        """Return a new job, which is at the end of the queue once it is added."""
         seq = self._store.next_seq()
-        job = Job(
+        return Job(
             seq=seq,
             id=f"{seq:06X}{secrets.token_hex(5).upper()}",
             machine=self._machine,
             program=program.sha256,
             commands=program.commands,
+            name=name,
+            position=seq * _POSITION_STEP,
+            called=called,
             signals=signals,
+            reason=Reason.MACHINE_BUSY if called else Reason.QUEUE_POSITION,
             created_us=now_us(),
         )
-        self._put(job)
-        self._unsaved.add(seq)
-        self._pay_debts()
-        if seq % _TRIM_EVERY == 0:
-            self._store.trim(self._machine, self._keep_stored)
-        future = self._store.add(job, actor)
-        # Not after the await: whoever waits may be canceled, and the job is on disk or is not all the same.
-        future.add_done_callback(partial(self._added, job))
-        await asyncio.shield(future)
-        return self._jobs.get(seq, job)
 
-    async def change(self, job: Job, actor: str = SYSTEM) -> None:
-        """Make a transition that a machine may rest on; it is on disk when this returns.
+    async def add(self, jobs: Sequence[Job], actor: str) -> None:
+        """Add new jobs; they are on disk when this returns.
 
         Raises:
-            StorageError: it could not be stored, and the job is as it was.
+            StorageError: they could not be stored, and there are no such jobs.
         """
-        before = self._jobs[job.seq]
-        self._put(job)
+        for job in jobs:
+            self._unsaved.add(job.seq)
+            self._put(job)
         self._pay_debts()
-        try:
-            await asyncio.shield(self._store.update(job, now_us(), actor))
-        except StorageError:
-            if self._jobs.get(job.seq) is job:
-                self._put(before)
-            raise
-        self._changed(job)
+        if any(job.seq % _TRIM_EVERY == 0 for job in jobs):
+            self._store.trim(self._machine, self._keep_stored)
+        future = self._store.add(jobs, actor)
+        # Not after the await: whoever waits may be canceled, and the jobs are on disk or not all the same.
+        future.add_done_callback(partial(self._added, jobs))
+        await asyncio.shield(future)
+
+    async def change(self, *jobs: Job, actor: str = SYSTEM) -> None:
+        """Make transitions that a machine may rest on; they are on disk when this returns.
+
+        Raises:
+            StorageError: they could not be stored, and the jobs are as they were.
+        """
+        before = [self._jobs[job.seq] for job in jobs]
+        for job in jobs:
+            self._put(job)
+            self._changing[job.seq] = job
+        self._pay_debts()
+        future = self._store.update(jobs, now_us(), actor)
+        future.add_done_callback(partial(self._settled, jobs, before))  # As in `add`.
+        await asyncio.shield(future)
 
     def explain(self, job: Job, reason: Reason) -> None:
         """Say why a pending job waits; it changes with the machine, so it is not stored."""
@@ -149,24 +171,40 @@ class Ledger:
         If it did not, it is tried again until it does, and always before what is stored later.
         """
         self._put(job)
+        self._forget()
         self._pay_debts()
         return self._submit(job, actor)
 
-    def end_all(self, state: JobState, reason: Reason, actor: str) -> "list[asyncio.Future[None]]":
-        """End every job that has not ended, as `declare`."""
+    def end_called(self, state: JobState, reason: Reason, actor: str) -> "list[asyncio.Future[None]]":
+        """End every job that has not ended and does not just wait in the queue, as `declare`."""
         at_us = now_us()
-        return [self.declare(job.to(state, reason, at_us), actor) for job in self.open]
+        return [self.declare(job.to(state, reason, at_us), actor) for job in self.called]
 
-    def _added(self, job: Job, future: "asyncio.Future[None]") -> None:
-        self._unsaved.discard(job.seq)
-        if future.cancelled() or future.exception() is not None:
-            self._jobs.pop(job.seq, None)
-            self._open.pop(job.seq, None)
-        else:
+    def _added(self, jobs: Sequence[Job], future: "asyncio.Future[None]") -> None:
+        failed = future.cancelled() or future.exception() is not None
+        self._queued = None
+        for job in jobs:
+            self._unsaved.discard(job.seq)
+            if failed:
+                self._jobs.pop(job.seq, None)
+                self._open.pop(job.seq, None)
+                self._called.pop(job.seq, None)
+        for job in () if failed else jobs:
             self._changed(self._jobs.get(job.seq, job))
 
+    def _settled(self, jobs: Sequence[Job], before: Sequence[Job], future: "asyncio.Future[None]") -> None:
+        failed = future.cancelled() or future.exception() is not None
+        for job, old in zip(jobs, before, strict=True):
+            if self._changing.get(job.seq) is job:
+                del self._changing[job.seq]
+            if failed and self._jobs.get(job.seq) is job:
+                self._put(old)
+        self._forget()
+        for job in () if failed else jobs:
+            self._changed(job)
+
     def _submit(self, job: Job, actor: str) -> "asyncio.Future[None]":
-        future = self._store.update(job, now_us(), actor)
+        future = self._store.update([job], now_us(), actor)
         future.add_done_callback(partial(self._submitted, job, actor))
         return future
 
@@ -200,12 +238,25 @@ class Ledger:
 
     def _put(self, job: Job) -> None:
         self._jobs[job.seq] = job
+        self._queued = None
+        if _is_queued(job):
+            self._called.pop(job.seq, None)
+        elif not job.ended:
+            self._called[job.seq] = job
         if not job.ended:
             self._open[job.seq] = job
             return
         self._open.pop(job.seq, None)
+        self._called.pop(job.seq, None)
+
+    def _forget(self) -> None:
+        """Leave the oldest ended jobs that are too many, but none whose end may still be undone."""
         surplus = len(self._jobs) - len(self._open) - self._keep_shown
         if surplus > 0:
-            ended = [seq for seq, old in self._jobs.items() if old.ended][:surplus]
-            for seq in ended:
+            ended = (seq for seq, job in self._jobs.items() if job.ended and seq not in self._changing)
+            for seq in list(islice(ended, surplus)):
                 del self._jobs[seq]
+
+
+def _is_queued(job: Job) -> bool:
+    return job.state is JobState.PENDING and not job.called

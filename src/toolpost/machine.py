@@ -11,7 +11,8 @@ from toolpost.core.machine import Execution
 from toolpost.core.report import Report
 from toolpost.drivers.base import Driver
 from toolpost.drivers.registry import open_driver
-from toolpost.events import Events, JobChanged, MachineChanged, Reported
+from toolpost.events import Events, JobChanged, MachineChanged, QueueAction, QueueChanged, Reported
+from toolpost.job_queue import JobQueue
 from toolpost.ledger import Ledger
 from toolpost.runner import Runner
 from toolpost.store import Store
@@ -58,12 +59,16 @@ class Machine:
             keep_stored=config.history.stored,
             changed=self._job_changed,
         )
+        self.queue = JobQueue(
+            name, config.queue, self.ledger, self.driver, store.settings, self._queue_changed
+        )
         self.runner = Runner(name, self.ledger, self.driver, store.programs)
         self._tasks: list[asyncio.Task[None]] = []
 
     def start(self) -> None:
         """Take up what the store knows and begin to drive."""
         self.ledger.load(load_on_startup=self.config.queue.load_on_startup)
+        self.queue.load()
         self._tasks = [
             asyncio.create_task(self.driver.run(), name=f"{self.name}: link"),
             asyncio.create_task(self.runner.run(), name=f"{self.name}: runner"),
@@ -85,6 +90,7 @@ class Machine:
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
+        self.queue.close()
         self.driver.close()
         self.ledger.close()
 
@@ -115,10 +121,15 @@ class Machine:
     def changed(self) -> None:
         """The machine's state has changed."""
         self.runner.wake()
+        self.queue.machine_changed()
         self._events.publish(MachineChanged(self.name, self.driver.state))
+
+    def _queue_changed(self, action: QueueAction, listed: bool) -> None:
+        self._events.publish(QueueChanged(self.name, action, listed))
 
     def _job_changed(self, job: Job) -> None:
         self.runner.wake()
+        self.queue.job_changed(job)
         self._events.publish(JobChanged(job))
 
     def _task_ended(self, task: asyncio.Task[None]) -> None:

@@ -8,11 +8,17 @@ import msgspec
 from toolpost.clock import now_us
 from toolpost.core.grid import SampleGrid
 from toolpost.core.job import Job, JobState, Reason
+from toolpost.core.machine import LinkState
+from toolpost.core.program import Program
+from toolpost.core.queue import QueueView
 from toolpost.core.report import Report, Value
 from toolpost.drivers.base import LineKind
 from toolpost.errors import InvalidLineError, InvalidRequestError, NotAcceptedError, StorageError
+from toolpost.gcode.entries import PinnedFile
+from toolpost.gcode.reader import read_lines
 from toolpost.machine import Machine
 from toolpost.store import Store
+from toolpost.store.files import Files
 from toolpost.telemetry import Telemetry
 
 _READERS = 4
@@ -50,6 +56,7 @@ class Shop:
         machines: by name; the first is the default one.
         store: jobs, programs and settings.
         telemetry: the reports.
+        files: the ``gcodes`` root.
         programs_bytes: bound of the programs that no job needs.
     """
 
@@ -58,6 +65,7 @@ class Shop:
         machines: dict[str, Machine],
         store: Store,
         telemetry: Telemetry,
+        files: Files,
         programs_bytes: int,
     ) -> None:
         self._machines = machines
@@ -65,6 +73,8 @@ class Shop:
         self._stored_jobs = store.jobs
         self._telemetry = telemetry
         self._programs_bytes = programs_bytes
+        self._files = files
+        self._made: dict[tuple[str, str], Program] = {}
         # Each may make a large answer: so many at a time, whatever is asked.
         self._readers = asyncio.Semaphore(_READERS)
         self._adding: dict[str, int] = dict.fromkeys(machines, 0)
@@ -74,6 +84,11 @@ class Shop:
     def machines(self) -> list[str]:
         """The names of all machines, the default one first."""
         return list(self._machines)
+
+    @property
+    def files(self) -> Files:
+        """The ``gcodes`` root, which all machines share."""
+        return self._files
 
     # Lines
 
@@ -99,7 +114,7 @@ class Shop:
             return True
         if urgent is None:
             urgent = line.kind is LineKind.SIGNAL
-        if not urgent and (target.ledger.open or self._adding[machine]):
+        if not urgent and (target.ledger.called or self._adding[machine]):
             return False
         if line.kind is LineKind.NOTHING:
             return True
@@ -142,7 +157,7 @@ class Shop:
             StorageError: it could not be stored, and there is no such job.
         """
         target = self._machines[machine]
-        if target.ledger.open or self._adding[machine]:
+        if target.ledger.called or self._adding[machine]:
             raise NotAcceptedError("a job has not ended")
         if not target.driver.accepting:
             raise NotAcceptedError("the machine does not answer")
@@ -152,14 +167,15 @@ class Shop:
             program = await asyncio.to_thread(self._programs.add, _commands(target, lines))
             if self._cancels[machine] != cancels:
                 raise NotAcceptedError("everything was canceled meanwhile")
-            job = await target.ledger.add(program, signals, actor)
+            job = target.ledger.new(program, signals)
+            await target.ledger.add([job], actor)
         finally:
             self._adding[machine] -= 1
         self._trim_programs()
-        return job
+        return target.ledger.get(job.seq) or job
 
     async def cancel(self, machine: str, actor: str) -> None:
-        """Stop a machine and cancel all of its jobs that have not ended.
+        """Stop a machine, cancel every job that runs or is about to, and pause its queue.
 
         The machine is told before this awaits anything; the jobs' end is on disk when it returns.
 
@@ -169,7 +185,8 @@ class Shop:
         target = self._machines[machine]
         self._cancels[machine] += 1
         target.driver.stop()
-        records = target.ledger.end_all(JobState.CANCELED, Reason.CANCELED_BY_USER, actor)
+        target.queue.halt()
+        records = target.ledger.end_called(JobState.CANCELED, Reason.CANCELED_BY_USER, actor)
         results = await asyncio.gather(*records, return_exceptions=True)
         if any(isinstance(result, StorageError) for result in results):
             raise StorageError("everything was stopped, but the disk did not take the record of it")
@@ -193,7 +210,7 @@ class Shop:
         target = self._machines[machine]
         state = target.driver.state
         host_commands = state.waiting_commands
-        for job in target.ledger.open:
+        for job in target.ledger.called:
             if job.state is JobState.PROCESSING:
                 host_commands += job.commands - state.job_sent
             elif job.state is not JobState.PROCESSING_STOPPED:
@@ -206,6 +223,86 @@ class Shop:
             machine_commands=state.machine_commands,
             running_job=active.id if active is not None else None,
         )
+
+    # The queue
+
+    def queue(self, machine: str) -> QueueView:
+        """Return a machine's queue."""
+        return self._machines[machine].queue.view
+
+    async def enqueue(
+        self,
+        machine: str,
+        names: Sequence[str],
+        *,
+        replace: bool,
+        shown: frozenset[str] | None,
+        actor: str,
+    ) -> None:
+        """Add files to a queue, or make the queue a list of files; it is on disk when this returns.
+
+        Args:
+            machine: name of the machine.
+            names: files in the ``gcodes`` root; what they hold now is what will run.
+            replace: the list is the whole queue; jobs that are in it already are kept (`reconcile`).
+            shown: ids of the jobs that the client has been shown, None for all; no other is removed.
+            actor: who asks.
+
+        Raises:
+            FileMissingError, InvalidRequestError: a file is not there or no program for this machine, and
+                nothing has changed.
+            StorageError: it could not be stored.
+        """
+        target = self._machines[machine]
+        distinct = list(dict.fromkeys(names))
+        pinned = await self._files.pin_all(distinct)
+        programs = {}
+        for name, file in zip(distinct, pinned, strict=True):
+            programs[name] = await asyncio.to_thread(self._program_of, target, name, file)
+        entries = [(name, programs[name]) for name in names]
+        if replace:
+            await target.queue.replace(entries, shown, actor)
+        else:
+            await target.queue.add(entries, actor)
+
+    async def dequeue(self, machine: str, job_ids: Sequence[str] | None, actor: str) -> None:
+        """Remove waiting jobs, all of them for None; StorageError if that could not be stored."""
+        await self._machines[machine].queue.remove(job_ids, actor)
+
+    async def jump(self, machine: str, job_id: str, actor: str) -> None:
+        """Put a waiting job first.
+
+        Raises:
+            InvalidRequestError: there is no such job in the queue.
+            StorageError: it could not be stored.
+        """
+        if not await self._machines[machine].queue.jump(job_id, actor):
+            raise InvalidRequestError(f"Invalid job id: {job_id}")
+
+    async def pause_queue(self, machine: str) -> None:
+        """Load nothing more."""
+        await self._machines[machine].queue.pause()
+
+    async def start_queue(self, machine: str) -> None:
+        """Load the next job, now or when the machine has completed what it does."""
+        await self._machines[machine].queue.start()
+
+    def _program_of(self, target: Machine, name: str, file: PinnedFile) -> Program:
+        """Return the program that a file is to a machine. Blocks."""
+        key = (target.config.driver, file.sha256)
+        known = self._made.get(key)
+        if known is not None and self._programs.has(known.sha256):
+            return known
+        try:
+            program = self._programs.add(_commands(target, read_lines(file.path)))
+        except InvalidLineError as error:
+            raise InvalidRequestError(f"{name}, line {error.index + 1}: {error.problem}") from None
+        self._made[key] = program
+        return program
+
+    def link(self, machine: str) -> LinkState:
+        """Return the state of a machine's link."""
+        return self._machines[machine].driver.state.link
 
     # Init lines
 

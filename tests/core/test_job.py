@@ -1,9 +1,9 @@
 import itertools
 
+import msgspec
 import pytest
 
 from toolpost.core.job import Job, JobState, Reason, TransitionError, after_restart
-from toolpost.core.queue import active, next_to_start
 
 S = JobState
 ALLOWED = {
@@ -82,25 +82,22 @@ def test_no_restart_starts_a_job(state):
         assert new.state is not S.PROCESSING
 
 
-def test_the_first_pending_job_is_next_whatever_the_order():
-    jobs = [job(S.PENDING, 3), job(S.PENDING_HELD, 1), job(S.COMPLETED, 0), job(S.PENDING, 2)]
-    for order in itertools.permutations(jobs):
-        assert next_to_start(order).seq == 2
+@pytest.mark.parametrize("load_on_startup", [True, False])
+@pytest.mark.parametrize("state", S)
+def test_after_restart_a_called_job_of_the_queue_is_back_in_it(state, load_on_startup):
+    old = job(state, name="a.gcode", called=True, position=7, detail="words")
+    new = after_restart(old, load_on_startup=load_on_startup, at_us=50)
+    if state is S.PROCESSING:
+        assert (new.state, new.reason) == (S.PROCESSING_STOPPED, Reason.HOST_RESTARTED)
+    elif state is S.PENDING:
+        assert new == msgspec.structs.replace(old, called=False, reason=Reason.QUEUE_POSITION)
+        assert new.position == 7, "at its place"
+    else:
+        assert new is old
 
 
-@pytest.mark.parametrize("state", [S.PROCESSING, S.PROCESSING_STOPPED])
-def test_a_started_job_holds_the_machine(state):
-    jobs = [job(S.PENDING, 1), job(state, 2)]
-    assert active(jobs).seq == 2
-    assert next_to_start(iter(jobs)) is None
-
-
-@pytest.mark.parametrize("state", sorted(set(S) - {S.PENDING, S.PROCESSING, S.PROCESSING_STOPPED}))
-def test_other_jobs_neither_start_nor_hold(state):
-    assert next_to_start([job(state)]) is None
-    assert active([job(state)]) is None
-
-
-def test_no_jobs():
-    assert next_to_start([]) is None
-    assert active([]) is None
+@pytest.mark.parametrize("load_on_startup", [True, False])
+@pytest.mark.parametrize("name", ["", "a.gcode"])
+def test_after_restart_what_waits_in_the_queue_goes_on_waiting(name, load_on_startup):
+    old = job(name=name, called=False, reason=Reason.QUEUE_POSITION)
+    assert after_restart(old, load_on_startup=load_on_startup, at_us=50) is old

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -32,6 +33,9 @@ jobs = st.builds(
     machine=texts,
     program=texts,
     commands=st.integers(0, 2**40),
+    name=texts,
+    position=st.integers(-(2**62), 2**62),
+    called=st.booleans(),
     signals=st.dictionaries(texts, st.floats(0.01, 1e6), max_size=3),
     state=st.sampled_from(JobState),
     reason=st.sampled_from(Reason),
@@ -49,18 +53,23 @@ def test_a_row_holds_all_of_a_job(given_job):
 
 def test_jobs_round_trip_and_their_events(tmp_path):
     path = tmp_path / "d.db"
-    first = job(1, signals={"?pos": 0.5}, detail="über 'x' \"y\"")
+    first = job(
+        1, name="ä b/c.gcode", position=-5, called=False, signals={"?pos": 0.5}, detail="über 'x' \"y\""
+    )
 
     async def main():
         with opened(path) as database:
             store = JobStore(database)
-            await store.add(first, "me")
+            await store.add([first], "me")
             started = first.to(JobState.PROCESSING, Reason.RUNNING, 20)
-            await store.update(started, 21, "system")
-            assert store.load("m", 10) == [started]
+            await store.update([started], 21, "system")
+            found = store.load("m", 10)
+            assert found == [started]
+            assert found[0].called is False
             assert store.load("other", 10) == []
+            started = msgspec.structs.replace(started, position=2**60, called=True)
             ended = started.to(JobState.ABORTED, Reason.LINK_LOST, 30, "gone")
-            await store.update(ended, 31, "system")
+            await store.update([ended], 31, "system")
         with opened(path) as database:
             assert JobStore(database).load("m", 10) == [ended]
 
@@ -88,7 +97,7 @@ def test_numbers_are_never_used_again(tmp_path):
                 for _ in range(3):
                     seq = store.next_seq()
                     used.append(seq)
-                    await store.add(job(seq, state=JobState.COMPLETED), "me")
+                    await store.add([job(seq, state=JobState.COMPLETED)], "me")
                 await store.trim("m", 1)
                 await database.write(lambda connection: connection.execute("DELETE FROM job"))
         assert used == list(range(1, 10))
@@ -102,7 +111,7 @@ def test_load_has_the_newest_and_all_that_have_not_ended(tmp_path):
             store = JobStore(database)
             for seq in range(1, 31):
                 state = OPEN[seq % 4] if seq in {2, 3, 8, 9, 29} else ENDED[seq % 3]
-                await store.add(job(seq, state=state, machine="m" if seq != 9 else "n"), "me")
+                await store.add([job(seq, state=state, machine="m" if seq != 9 else "n")], "me")
             assert [found.seq for found in store.load("m", 4)] == [2, 3, 8, 27, 28, 29, 30]
             assert [found.seq for found in store.load("n", 4)] == [9]
 
@@ -114,7 +123,7 @@ def test_programs_in_use_are_those_of_jobs_not_ended(tmp_path):
         with opened(tmp_path / "d.db") as database:
             store = JobStore(database)
             for seq, state in enumerate(JobState, start=1):
-                await store.add(job(seq, state=state, program=state.value, machine=f"m{seq}"), "me")
+                await store.add([job(seq, state=state, program=state.value, machine=f"m{seq}")], "me")
             assert store.programs_in_use() == {state.value for state in OPEN}
 
     run(main)
@@ -126,9 +135,9 @@ def test_trim_keeps_the_newest_and_what_has_not_ended(tmp_path):
             store = JobStore(database)
             for seq in range(1, 11):
                 await store.add(
-                    job(seq, state=JobState.PENDING_HELD if seq == 2 else JobState.COMPLETED), "me"
+                    [job(seq, state=JobState.PENDING_HELD if seq == 2 else JobState.COMPLETED)], "me"
                 )
-            await store.add(job(11, machine="other", state=JobState.COMPLETED), "me")
+            await store.add([job(11, machine="other", state=JobState.COMPLETED)], "me")
             await store.trim("m", 100)
             assert len(store.load("m", 100)) == 10
             await store.trim("m", 3)
@@ -146,16 +155,43 @@ def test_a_job_the_disk_does_not_take_is_not_there(tmp_path):
     async def main():
         with opened(tmp_path / "d.db") as database:
             store = JobStore(database)
-            await store.add(job(1), "me")
+            await store.add([job(1)], "me")
             await fill(database)
             with pytest.raises(StorageError):
-                await store.add(job(2, detail="x" * 10_000), "me")
+                await store.add([job(2, detail="x" * 10_000)], "me")
             with pytest.raises(StorageError):
-                await store.update(job(1, detail="x" * 10_000), 5, "me")
+                await store.update([job(1, detail="x" * 10_000)], 5, "me")
             assert store.load("m", 10) == [job(1)]
             await free(database)
-            await store.add(job(3), "me")
+            await store.add([job(3)], "me")
             assert [found.seq for found in store.load("m", 10)] == [1, 3]
+
+    run(main)
+
+
+def test_jobs_added_or_changed_together_are_all_stored_or_none(tmp_path):
+    async def main():
+        with opened(tmp_path / "d.db") as database:
+            store = JobStore(database)
+            first = [job(1), job(2)]
+            await store.add(first, "me")
+            await store.add([], "me")
+            with pytest.raises(sqlite3.IntegrityError):
+                await store.add([job(3), job(4), job(2)], "me")
+            await fill(database)
+            with pytest.raises(StorageError):
+                await store.add([job(5), job(6, detail="x" * 20_000), job(7)], "me")
+            with pytest.raises(StorageError):
+                await store.update([job(1, position=9), job(2, detail="x" * 20_000)], 5, "me")
+            assert store.load("m", 10) == first
+            await free(database)
+            events = await database.write(lambda c: c.execute("SELECT job FROM job_event").fetchall())
+            assert sorted(events) == [(1,), (2,)], "no event of what was not stored"
+            changed = [job(1, position=9), job(2, called=False)]
+            await store.update(changed, 5, "me")
+            assert store.load("m", 10) == changed
+            events = await database.write(lambda c: c.execute("SELECT job FROM job_event").fetchall())
+            assert sorted(events) == [(1,), (1,), (2,), (2,)]
 
     run(main)
 

@@ -41,6 +41,7 @@ class Reason(enum.StrEnum):
     MACHINE_RESET = "machine-reset"
     MACHINE_SILENT = "machine-silent"
     PROGRAM_MISSING = "program-missing"
+    QUEUE_POSITION = "queue-position"
     QUEUE_FULL = "queue-full"
 
 
@@ -71,6 +72,9 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
         machine: name of the machine it runs on.
         program: SHA-256 of the program's content, in hex.
         commands: number of commands in the program.
+        name: name of the file in the ``gcodes`` root that it was made from, or "".
+        position: place among the waiting jobs; the lowest is the next.
+        called: whether it may start as soon as the machine is ready; the queue calls its jobs one by one.
         signals: signal line to interval in seconds, sent while the job runs.
         state: where it is in its life.
         reason: why it is there.
@@ -83,6 +87,9 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
     machine: str
     program: str
     commands: int
+    name: str = ""
+    position: int = 0
+    called: bool = True
     signals: dict[str, float] = {}
     state: JobState = JobState.PENDING
     reason: Reason = Reason.MACHINE_BUSY
@@ -119,12 +126,17 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
 def after_restart(job: Job, *, load_on_startup: bool, at_us: int) -> Job:
     """Return what a job found in the store at start has become.
 
-    No job that had started goes on or starts again by itself: a person decides. A job that had not
-    started waits on if the queue may load at start-up, and is held otherwise, because a machine that
-    begins to move when the power comes back surprises whoever stands before it.
+    No job that had started goes on or starts again by itself: a person decides. A job that was called but
+    had not started goes back into the queue, if it came from there. Any other waits on if the queue may
+    load at start-up, and is held otherwise, because a machine that begins to move when the power comes
+    back surprises whoever stands before it.
     """
     if job.state is JobState.PROCESSING:
         return job.to(JobState.PROCESSING_STOPPED, Reason.HOST_RESTARTED, at_us)
-    if job.state is JobState.PENDING and not load_on_startup:
+    if job.state is not JobState.PENDING or not job.called:
+        return job
+    if job.name:
+        return msgspec.structs.replace(job, called=False, reason=Reason.QUEUE_POSITION)
+    if not load_on_startup:
         return job.to(JobState.PENDING_HELD, Reason.HOST_RESTARTED, at_us)
     return job

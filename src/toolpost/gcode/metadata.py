@@ -28,6 +28,7 @@ T = TypeVar("T")
 _MAX_VALUE = 1e9
 _MAX_HEIGHT = 1e5
 _MAX_ITEMS = 64
+_MAX_COMMENTS = 20_000
 
 _COMMENT_LINE = re.compile(rb"\n;[^\r\n]*")
 _COMMENT = re.compile(rb"^;[ \t]{0,8}([A-Za-z][^=:,\r\n]{0,63})[=:,]([^\r\n]*)", re.MULTILINE)
@@ -146,10 +147,11 @@ def parse_metadata(head: bytes, tail: bytes = b"", offset: int = 0) -> Metadata:
         offset: where in the file `tail` begins.
     """
     # Most of a file are commands; without them, all that follows is done in no time.
-    comments = b"".join(_COMMENT_LINE.findall(b"\n" + head))
-    endings = b"".join(_COMMENT_LINE.findall(tail)) if tail else comments
+    lines = _COMMENT_LINE.findall(b"\n" + head)
+    comments = b"".join(lines[:_MAX_COMMENTS])
+    endings = b"".join((_COMMENT_LINE.findall(tail) if tail else lines)[-_MAX_COMMENTS:])
     slicer, version = _slicer(comments)
-    values = _Values(comments + endings if tail else comments)
+    values = _Values(comments + endings)
     weights = values.numbers(b"filamentusedg")
     # A few slicers leave to the layers what others say in a line.
     top = values.number(b"maxzheight", b"maxz", b"printsizemaxz")

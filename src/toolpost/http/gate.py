@@ -12,17 +12,19 @@ import socket
 import time
 from collections import OrderedDict
 from collections.abc import Callable
-from typing import Final
+from typing import Final, NamedTuple
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from toolpost.config import ServerConfig
-from toolpost.http.answer import CORS_METHODS, send_answer, send_text
+from toolpost.http.answer import CORS_METHODS, TEXT, send_answer, send_text
 
 _LOCAL_NAMES: Final = frozenset({"localhost", "127.0.0.1", "[::1]"})
 _HOST: Final = re.compile(rb"(\[[0-9a-f:.]+\]|[^\[\]:@/]+)(?::[0-9]*)?")
 _SIMPLE_TYPES: Final = (b"text/plain", b"application/x-www-form-urlencoded", b"multipart/form-data")
 _BROWSER_HEADERS: Final = frozenset({b"origin", b"sec-fetch-site", b"sec-fetch-mode"})
+
+_CHANGING: Final = frozenset({"POST", "PUT", "PATCH", "DELETE"})
 
 _FAILURES: Final = 20
 _FAILURE_WINDOW: Final = 60.0
@@ -37,6 +39,7 @@ class Gate:
         config: hosts, origins and networks that are let in.
         local: whether the listener is on a loopback address, where no key is required.
         key_owner: returns the name of a key, or None if it is no valid key.
+        takes_forms: whether forms are part of the API at a path.
     """
 
     def __init__(
@@ -46,10 +49,12 @@ class Gate:
         *,
         local: bool,
         key_owner: Callable[[str], str | None],
+        takes_forms: Callable[[str], bool] = lambda _: False,
     ) -> None:
         self._app = app
         self._local = local
         self._key_owner = key_owner
+        self._takes_forms = takes_forms
         self._networks = [ipaddress.ip_network(text) for text in config.open_networks]
         own = socket.gethostname().lower()
         self._hosts = _LOCAL_NAMES | {own, f"{own}.local"} | {host.lower() for host in config.hosts}
@@ -58,30 +63,63 @@ class Gate:
         self._failures = FailureLimit()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Let a request through, or answer it here."""
-        if scope["type"] != "http":
-            return
-        host, origin, key, content_type, browser = _read_headers(scope)
-        if host is None or not self._allows_host(host):
-            await send_text(send, 403, "this server does not go by that name (Host); see server.hosts")
-            return
-        if origin is not None and not self._allows_origin(host, origin):
-            await send_text(send, 403, "pages of this origin may not call (Origin); see server.origins")
-            return
-        if origin is not None:
-            send = _with_cors(send, origin)
-        if scope["method"] == "OPTIONS":
-            await send_answer(send, 204, b"", None)
-            return
-        refusal = self._check_key(scope, key)
+        """Let a request or a WebSocket through, or answer it here."""
+        if scope["type"] == "http":
+            await self._pass_http(scope, receive, send)
+        elif scope["type"] == "websocket":
+            await self._pass_websocket(scope, receive, send)
+
+    async def _pass_http(self, scope: Scope, receive: Receive, send: Send) -> None:
+        headers = _read_headers(scope)
+        refusal = self._check_names(headers)
         if refusal is not None:
             await send_text(send, *refusal)
             return
-        if scope["method"] == "POST" and _is_simple(content_type, browser):
-            # A browser sends these without asking first, whatever page it is on.
-            await send_text(send, 400, "the Content-Type must be application/json")
+        if headers.origin is not None:
+            send = _with_cors(send, headers.origin)
+        if scope["method"] == "OPTIONS":
+            await send_answer(send, 204, b"", None)
+            return
+        refusal = self._check_key(scope, headers.key) or self._check_type(scope, headers)
+        if refusal is not None:
+            await send_text(send, *refusal)
             return
         await self._app(scope, receive, send)
+
+    async def _pass_websocket(self, scope: Scope, receive: Receive, send: Send) -> None:
+        headers = _read_headers(scope)
+        refusal = self._check_names(headers) or self._check_key(scope, headers.key)
+        if refusal is None:
+            await self._app(scope, receive, send)
+            return
+        status, text = refusal
+        await receive()
+        start = {
+            "type": "websocket.http.response.start",
+            "status": status,
+            "headers": [(b"content-type", TEXT)],
+        }
+        await send(start)
+        await send({"type": "websocket.http.response.body", "body": text.encode()})
+
+    def _check_names(self, headers: "_Headers") -> tuple[int, str] | None:
+        """Return status and text of a refusal by Host or Origin, or None."""
+        if headers.host is None or not self._allows_host(headers.host):
+            return 403, "this server does not go by that name (Host); see server.hosts"
+        if headers.origin is not None and not self._allows_origin(headers.host, headers.origin):
+            return 403, "pages of this origin may not call (Origin); see server.origins"
+        return None
+
+    def _check_type(self, scope: Scope, headers: "_Headers") -> tuple[int, str] | None:
+        """Refuse what a browser sends without asking first, whatever page it is on.
+
+        Where forms are part of an API, an allowed origin is proof enough of the page; programs have none.
+        """
+        if scope["method"] not in _CHANGING or not _is_simple(headers.content_type, headers.browser):
+            return None
+        if self._takes_forms(scope["path"]) and (headers.origin is not None or not headers.browser):
+            return None
+        return 400, "the Content-Type must be application/json"
 
     def _check_key(self, scope: Scope, key: str | None) -> tuple[int, str] | None:
         """Return status and text of a refusal, or None; notes the actor in the scope."""
@@ -164,9 +202,17 @@ class FailureLimit:
         return count > _FAILURES and self._clock() - since <= _FAILURE_WINDOW
 
 
-def _read_headers(
-    scope: Scope,
-) -> tuple[bytes | None, bytes | None, str | None, bytes | None, bool]:
+class _Headers(NamedTuple):
+    """What counts of a request's headers."""
+
+    host: bytes | None
+    origin: bytes | None
+    key: str | None
+    content_type: bytes | None
+    browser: bool
+
+
+def _read_headers(scope: Scope) -> _Headers:
     host = origin = key = content_type = None
     browser = False
     for name, value in scope["headers"]:
@@ -183,7 +229,7 @@ def _read_headers(
             browser = True
             if name == b"origin":
                 origin = value
-    return host, origin, key, content_type, browser
+    return _Headers(host, origin, key, content_type, browser)
 
 
 def _is_simple(content_type: bytes | None, browser: bool) -> bool:
@@ -213,7 +259,10 @@ def _with_cors(send: Send, origin: bytes) -> Send:
     headers = [
         (b"access-control-allow-origin", origin),
         (b"access-control-allow-methods", CORS_METHODS),
-        (b"access-control-allow-headers", b"Content-Type, X-Api-Key, Authorization"),
+        (
+            b"access-control-allow-headers",
+            b"Content-Type, X-Api-Key, Authorization, X-Access-Token, X-Requested-With",
+        ),
         (b"access-control-max-age", b"600"),
         (b"vary", b"Origin"),
     ]

@@ -24,8 +24,6 @@ MAX_FIELD: Final = 4096
 """Longest value of a field, bytes."""
 MAX_HEADERS: Final = 4096
 """Longest headers of a part, bytes."""
-MAX_OVERHEAD: Final = (MAX_FIELDS + 1) * (MAX_FIELD + MAX_HEADERS)
-"""Bytes that a body may be longer than its file."""
 SLOW_AFTER: Final = 60.0
 """Seconds after which a body has to have come with MIN_RATE."""
 MIN_RATE: Final = 512
@@ -218,12 +216,12 @@ async def read_upload(
 
     Raises:
         MultipartError: the body is not well formed, or not the upload of exactly one file.
-        BodyTooLargeError: the file, or all that is around it, is too long.
+        BodyTooLargeError: the file is too long.
         ClientGoneError: the client went away, sends nothing, or too slowly.
     """
     parser = MultipartParser(parse_boundary(content_type))
     form = _Form(sink, max_bytes, file_field)
-    async for piece in _pieces(receive, max_bytes + MAX_OVERHEAD):
+    async for piece in _pieces(receive):
         for event in parser.feed(piece):
             await form.take(event)
     parser.close()
@@ -290,8 +288,8 @@ class _Form:
         self._part = None
 
 
-async def _pieces(receive: Receive, most: int) -> AsyncIterator[bytes]:
-    """Yield a body as it comes."""
+async def _pieces(receive: Receive) -> AsyncIterator[bytes]:
+    """Yield a body as it comes. How long it may be follows from the bounds of its parts."""
     started = time.monotonic()
     total, more = 0, True
     while more:
@@ -305,8 +303,6 @@ async def _pieces(receive: Receive, most: int) -> AsyncIterator[bytes]:
         piece: bytes = message.get("body", b"")
         more = message.get("more_body", False)
         total += len(piece)
-        if total > most:
-            raise BodyTooLargeError(f"the body must be at most {most} bytes")
         elapsed = time.monotonic() - started
         if more and elapsed > SLOW_AFTER and total < elapsed * MIN_RATE:
             raise ClientGoneError("the body comes too slowly")

@@ -6,12 +6,13 @@ import ipaddress
 import logging
 import socket
 from collections.abc import Iterator
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import uvicorn
 from httptools import HttpParserError
 from starlette.types import ASGIApp
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from toolpost.config import Address
 from toolpost.errors import StartError
@@ -23,6 +24,9 @@ MAX_HEAD: Final = 32 * 1024
 
 HEAD_TIMEOUT: Final = 15.0
 """Seconds within which the head of a request must have come once it has begun."""
+
+MAX_MESSAGE: Final = 8 * 2**20
+"""Bytes of one WebSocket message."""
 
 STALL_TIMEOUT: Final = 30.0
 """Seconds for which a client may leave its answer unread."""
@@ -115,6 +119,16 @@ class BoundedProtocol(HttpToolsProtocol):
             self._head_timer = None
 
 
+class BoundedWebSocket(WebSocketsSansIOProtocol):
+    """uvicorn's WebSocket, which the application can cut at once: a client that does not read is let go."""
+
+    def handle_connect(self, event: Any) -> None:  # noqa: ANN401  # as the base class has it
+        """Let the application know how to cut the connection."""
+        super().handle_connect(event)
+        if self.response.status_code == 101:
+            cast("dict[str, Any]", self.scope)["toolpost.abort"] = self.transport.abort
+
+
 class Listener(uvicorn.Server):
     """One address at which requests are answered.
 
@@ -129,7 +143,9 @@ class Listener(uvicorn.Server):
             uvicorn.Config(
                 app,
                 http=BoundedProtocol,
-                ws="none",
+                ws=BoundedWebSocket,
+                ws_max_size=MAX_MESSAGE,
+                ws_per_message_deflate=False,
                 lifespan="off",
                 log_config=None,
                 access_log=False,

@@ -168,7 +168,7 @@ class Files:
     # What the methods above do, in a thread.
 
     def _entries(self) -> list[Entry]:
-        with self._within() as root:
+        with _refusing(""), self._within() as root:
             every = itertools.islice(_walk(root, ""), MAX_ENTRIES)
             found = [entry for entry in every if not entry.is_directory]
         return sorted(found, key=lambda entry: entry.path)

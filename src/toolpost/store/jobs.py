@@ -2,6 +2,7 @@
 
 import asyncio
 import sqlite3
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
@@ -26,21 +27,22 @@ class JobStore:
         self._last_seq += 1
         return self._last_seq
 
-    def add(self, job: Job, actor: str) -> "asyncio.Future[None]":
-        """Store a new job; the future is done when it is on disk, or fails with StorageError."""
+    def add(self, jobs: Sequence[Job], actor: str) -> "asyncio.Future[None]":
+        """Store new jobs; the future is done when all are on disk, or fails with StorageError."""
 
         def apply(connection: sqlite3.Connection) -> None:
-            connection.execute(QUERIES["insert_job"], _row(job))
-            connection.execute(QUERIES["insert_event"], _event(job, job.created_us, actor))
+            connection.executemany(QUERIES["insert_job"], [_row(job) for job in jobs])
+            events = [_event(job, job.created_us, actor) for job in jobs]
+            connection.executemany(QUERIES["insert_event"], events)
 
         return self._database.submit(apply)
 
-    def update(self, job: Job, at_us: int, actor: str) -> "asyncio.Future[None]":
-        """Store a job's transition, as `add`."""
+    def update(self, jobs: Sequence[Job], at_us: int, actor: str) -> "asyncio.Future[None]":
+        """Store what has become of jobs, as `add`."""
 
         def apply(connection: sqlite3.Connection) -> None:
-            connection.execute(QUERIES["update_job"], _row(job))
-            connection.execute(QUERIES["insert_event"], _event(job, at_us, actor))
+            connection.executemany(QUERIES["update_job"], [_row(job) for job in jobs])
+            connection.executemany(QUERIES["insert_event"], [_event(job, at_us, actor) for job in jobs])
 
         return self._database.submit(apply)
 
@@ -74,6 +76,7 @@ def _row(job: Job) -> dict[str, Any]:
 def _job(row: tuple[Any, ...]) -> Job:
     values = dict(zip(Job.__struct_fields__, row, strict=True))
     values["signals"] = msgspec.json.decode(values["signals"])
+    values["called"] = bool(values["called"])
     return msgspec.convert(values, Job)
 
 

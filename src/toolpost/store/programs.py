@@ -28,7 +28,7 @@ class ProgramStore:
         directory.mkdir(parents=True, exist_ok=True)
         for left_over in directory.glob("*.part"):
             left_over.unlink(missing_ok=True)
-        self._total = sum(_on_disk(path.stat()) for path in directory.iterdir())
+        self._total = sum(_on_disk(path.stat()) for path in self._programs())
 
     def add(self, blocks: Iterable[list[bytes]]) -> Program:
         """Store commands and return their program; it is on disk when this returns. Blocks; for a thread.
@@ -79,6 +79,10 @@ class ProgramStore:
         except OSError as error:
             raise StorageError(f"program {sha256[:12]} cannot be read: {error.strerror}") from None
 
+    def has(self, sha256: str) -> bool:
+        """Whether there is such a program."""
+        return self._path(sha256).exists()
+
     @property
     def size(self) -> int:
         """Bytes that all programs take together."""
@@ -88,7 +92,7 @@ class ProgramStore:
         """Delete the oldest programs that no job needs, if all together are larger than `max_bytes`."""
         if self._total <= max_bytes:
             return
-        files = [(path, path.stat()) for path in self._directory.iterdir() if path.suffix != ".part"]
+        files = [(path, path.stat()) for path in self._programs()]
         self._total = sum(_on_disk(stat) for _, stat in files)
         for path, stat in sorted(files, key=lambda file: file[1].st_mtime):
             if self._total <= max_bytes * _TRIM_TO:
@@ -96,6 +100,9 @@ class ProgramStore:
             if path.name not in in_use:
                 path.unlink(missing_ok=True)
                 self._total -= _on_disk(stat)
+
+    def _programs(self) -> list[Path]:
+        return [path for path in self._directory.iterdir() if path.is_file() and path.suffix != ".part"]
 
     def _path(self, sha256: str) -> Path:
         return self._directory / sha256

@@ -1,12 +1,13 @@
 -- name: insert_job
-INSERT INTO job (seq, id, machine, program, commands, signals, state, reason, detail,
+INSERT INTO job (seq, id, machine, program, commands, name, position, called, signals, state, reason, detail,
                  created_us, started_us, ended_us)
-VALUES (:seq, :id, :machine, :program, :commands, :signals, :state, :reason, :detail,
+VALUES (:seq, :id, :machine, :program, :commands, :name, :position, :called, :signals, :state, :reason, :detail,
         :created_us, :started_us, :ended_us);
 
 -- name: update_job
 UPDATE job
-SET state = :state, reason = :reason, detail = :detail, started_us = :started_us, ended_us = :ended_us
+SET position = :position, called = :called, state = :state, reason = :reason, detail = :detail,
+    started_us = :started_us, ended_us = :ended_us
 WHERE seq = :seq;
 
 -- name: insert_event
@@ -17,12 +18,12 @@ SELECT seq, :time_us, :actor, :state, :reason, :detail FROM job WHERE seq = :job
 SELECT COALESCE((SELECT seq FROM sqlite_sequence WHERE name = 'job'), 0);
 
 -- name: newest_jobs
-SELECT seq, id, machine, program, commands, signals, state, reason, detail,
+SELECT seq, id, machine, program, commands, name, position, called, signals, state, reason, detail,
        created_us, started_us, ended_us
 FROM job WHERE machine = :machine ORDER BY seq DESC LIMIT :most;
 
 -- name: jobs_not_ended
-SELECT seq, id, machine, program, commands, signals, state, reason, detail,
+SELECT seq, id, machine, program, commands, name, position, called, signals, state, reason, detail,
        created_us, started_us, ended_us
 FROM job WHERE machine = :machine AND state IN ('pending', 'pending-held', 'processing', 'processing-stopped')
 ORDER BY seq;

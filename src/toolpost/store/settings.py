@@ -1,5 +1,6 @@
 """Settings of machines that clients write, such as the init lines."""
 
+import asyncio
 import sqlite3
 from typing import Any
 
@@ -29,9 +30,13 @@ class SettingStore:
         Raises:
             StorageError: it could not be stored, and the old value still holds.
         """
+        await self.submit(machine, name, value)
+
+    def submit(self, machine: str, name: str, value: object) -> "asyncio.Future[None]":
+        """Set a value, in order with all changes of the database; the future is done as `set` returns."""
         row = {"machine": machine, "name": name, "value": msgspec.json.encode(value).decode()}
 
         def apply(connection: sqlite3.Connection) -> None:
             connection.execute(QUERIES["set_setting"], row)
 
-        await self._database.write(apply)
+        return self._database.submit(apply)

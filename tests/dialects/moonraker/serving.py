@@ -44,29 +44,24 @@ class Answer(NamedTuple):
         return json.loads(self.body)
 
 
-class Service:
-    """What is served, and where."""
+class Site:
+    """Where a server is to be reached.
 
-    def __init__(
-        self, methods: Iterable[Method] = (), *, limit: int = 256, max_message: int = 1 << 20
-    ) -> None:
-        self.connections = Connections(limit)
-        self.queue = FakeQueue(self.connections)
-        self.methods = Methods([*self.queue.methods, *CONNECTION_METHODS, *methods])
-        endpoint = WebSocketEndpoint(self.methods, self.connections, max_message)
-        bodies = BodyReader(MAX_BODY, 2 * MAX_BODY)
-        routes = [MethodRoutes(self.methods, bodies), WebSocketRoute("/websocket", endpoint)]
-        self.app = Router(
-            [*routes, Mount("/machines/edm", routes=routes)], redirect_slashes=False, default=not_found
-        )
-        self.port = 0
+    Args:
+        port: on 127.0.0.1.
+        prefix: before every path, e.g. ``/machines/edm``.
+    """
+
+    def __init__(self, port: int, prefix: str = "") -> None:
+        self.port = port
+        self.prefix = prefix
 
     async def http(
         self, verb: str, path: str, body: bytes = b"", headers: dict[str, str] | None = None
     ) -> Answer:
         """Sends a request exactly so, and returns the answer."""
-        reader, writer = await asyncio.open_connection("127.0.0.1", self.port)
-        lines = [f"{verb} {path} HTTP/1.1", "Host: localhost", "Connection: close"]
+        reader, writer = await asyncio.open_connection("127.0.0.1", self.port, limit=2**24)
+        lines = [f"{verb} {self.prefix}{path} HTTP/1.1", "Host: localhost", "Connection: close"]
         lines += [f"{name}: {value}" for name, value in (headers or {}).items()]
         if body:
             lines.append(f"Content-Length: {len(body)}")
@@ -87,9 +82,27 @@ class Service:
 
     @contextlib.asynccontextmanager
     async def client(self, **options: Any) -> AsyncIterator["Client"]:
-        url = f"ws://127.0.0.1:{self.port}/websocket"
+        url = f"ws://127.0.0.1:{self.port}{self.prefix}/websocket"
         async with connect(url, compression=None, max_size=None, **options) as ws:
             yield Client(ws)
+
+
+class Service(Site):
+    """What is served, and where."""
+
+    def __init__(
+        self, methods: Iterable[Method] = (), *, limit: int = 256, max_message: int = 1 << 20
+    ) -> None:
+        super().__init__(0)
+        self.connections = Connections(limit)
+        self.queue = FakeQueue(self.connections)
+        self.methods = Methods([*self.queue.methods, *CONNECTION_METHODS, *methods])
+        endpoint = WebSocketEndpoint(self.methods, self.connections, max_message)
+        bodies = BodyReader(MAX_BODY, 2 * MAX_BODY)
+        routes = [MethodRoutes(self.methods, bodies), WebSocketRoute("/websocket", endpoint)]
+        self.app = Router(
+            [*routes, Mount("/machines/edm", routes=routes)], redirect_slashes=False, default=not_found
+        )
 
 
 class Client:

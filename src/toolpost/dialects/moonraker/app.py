@@ -1,0 +1,60 @@
+"""Moonraker's API for one machine, put together."""
+
+import re
+
+from starlette.routing import BaseRoute, WebSocketRoute
+
+from toolpost.dialects.moonraker.connections import Connections
+from toolpost.dialects.moonraker.files import FileMethods
+from toolpost.dialects.moonraker.http import MethodRoutes
+from toolpost.dialects.moonraker.identify import CONNECTION_METHODS
+from toolpost.dialects.moonraker.info import InfoMethods
+from toolpost.dialects.moonraker.job_queue import JobQueueMethods
+from toolpost.dialects.moonraker.rpc import Methods
+from toolpost.dialects.moonraker.transfer import Transfer
+from toolpost.dialects.moonraker.websocket import WebSocketEndpoint
+from toolpost.events import Events
+from toolpost.http.body import BodyReader
+from toolpost.shop import Shop
+
+_PATHS = re.compile(r"(?:/machines/[^/]+)?/(?:server|printer|machine|access)/.*")
+
+
+def takes_forms(path: str) -> bool:
+    """Whether arguments may come as a form at a path: Moonraker's clients send them so."""
+    return _PATHS.fullmatch(path) is not None
+
+
+class Moonraker:
+    """The API of one machine: its methods, and the connections that are told of changes.
+
+    Args:
+        shop: does the work.
+        machine: name of the machine.
+        events: what happens.
+    """
+
+    def __init__(self, shop: Shop, machine: str, events: Events) -> None:
+        self._connections = Connections()
+        queue = JobQueueMethods(shop, machine, self._connections)
+        info = InfoMethods(shop, machine, self._connections)
+        files = FileMethods(shop, self._connections)
+        parts = (queue, info, files)
+        self._methods = Methods([*CONNECTION_METHODS, *(m for part in parts for m in part.methods())])
+        self._unsubscribe = [events.subscribe(part.event) for part in parts]
+        self._transfer = Transfer(shop, machine, files)
+
+    def routes(self, bodies: BodyReader) -> list[BaseRoute]:
+        """Return the routes: each method over HTTP, all over WebSocket."""
+        socket = WebSocketEndpoint(self._methods, self._connections)
+        return [
+            *self._transfer.routes(),
+            MethodRoutes(self._methods, bodies),
+            WebSocketRoute("/websocket", socket),
+        ]
+
+    def close(self) -> None:
+        """Let go of all connections."""
+        for unsubscribe in self._unsubscribe:
+            unsubscribe()
+        self._connections.close_all()
