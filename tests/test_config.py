@@ -249,12 +249,7 @@ def test_two_machines_cannot_share_a_device():
         config_of(f"[machines.a]\n{machine}[machines.b]\n{machine}")
 
 
-QUEUE_OPTIONS = {
-    "automatic_transition": "true",
-    "job_transition_delay": "1.5",
-    "job_transition_gcode": '"G28"',
-    "bed": '"confirm"',
-}
+QUEUE_OPTIONS = {"bed": '"confirm"'}
 
 
 def test_queue_options_without_effect_are_named_at_the_start(tmp_path):

@@ -1,3 +1,5 @@
 """Toolpost: a job server for G-code machines."""
 
-__version__ = "0.1.0"
+from toolpost.version import VERSION as __version__
+
+__all__ = ["__version__"]

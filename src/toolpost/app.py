@@ -63,7 +63,7 @@ class App:
         """
         async with contextlib.AsyncExitStack() as opened:
             try:
-                machines, listeners = self._open(opened)
+                machines, listeners = await self._open(opened)
                 for machine in machines:
                     machine.start()
             except (OSError, sqlite3.Error, msgspec.MsgspecError, StorageError) as error:
@@ -74,7 +74,7 @@ class App:
             await self._stop.wait()
             log.info("stopping")
 
-    def _open(self, opened: contextlib.AsyncExitStack) -> tuple[list[Machine], list[Listener]]:
+    async def _open(self, opened: contextlib.AsyncExitStack) -> tuple[list[Machine], list[Listener]]:
         """Open everything; `opened` closes it again in the opposite order."""
         for key in without_effect(self._config):
             log.warning("%s has no effect yet", key)
@@ -94,6 +94,8 @@ class App:
             self._data / "programs" / "files",
             on_change=lambda change: events.publish(FileChanged(change)),
         )
+        # Jobs run from their programs; what is kept of the files only spares reading them again.
+        await files.trim(set(), self._config.storage.programs_bytes)
         shop = Shop(machines, store, telemetry, files, self._config.storage.programs_bytes)
         moonrakers = {name: Moonraker(shop, name, events) for name in machines}
         for moonraker in moonrakers.values():

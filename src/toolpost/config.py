@@ -21,7 +21,7 @@ from toolpost.telemetry.limits import Limits as TelemetryLimits
 DRIVERS: Final = ("spark",)
 """The drivers of this version."""
 
-_NOT_YET: Final = ("automatic_transition", "job_transition_delay", "job_transition_gcode", "bed")
+_NOT_YET: Final = ("bed",)
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 _ADDRESS = re.compile(r"(?:\[(?P<ipv6>[0-9a-fA-F:.]+)\]|(?P<host>[^\[\]:]+)):(?P<port>\d{1,5})")

@@ -109,10 +109,8 @@ class JobQueue:
             else:
                 last += 1
                 changed.append(msgspec.structs.replace(job, position=last))
-        if changed:
-            await self._ledger.change(*changed, actor=actor)
-        if added:
-            await self._ledger.add(added, actor)
+        if changed or added:
+            await self._ledger.change(*changed, added=added, actor=actor)
         self._added()
 
     async def remove(self, job_ids: Iterable[str] | None, actor: str) -> None:

@@ -133,30 +133,28 @@ class Ledger:
         Raises:
             StorageError: they could not be stored, and there are no such jobs.
         """
-        for job in jobs:
-            self._unsaved.add(job.seq)
-            self._put(job)
+        self._put_new(jobs)
         self._pay_debts()
-        if any(job.seq % _TRIM_EVERY == 0 for job in jobs):
-            self._store.trim(self._machine, self._keep_stored)
         future = self._store.add(jobs, actor)
         # Not after the await: whoever waits may be canceled, and the jobs are on disk or not all the same.
         future.add_done_callback(partial(self._added, jobs))
         await asyncio.shield(future)
 
-    async def change(self, *jobs: Job, actor: str = SYSTEM) -> None:
-        """Make transitions that a machine may rest on; they are on disk when this returns.
+    async def change(self, *jobs: Job, added: Sequence[Job] = (), actor: str = SYSTEM) -> None:
+        """Make transitions that a machine may rest on, and add new jobs; all is on disk when this returns.
 
         Raises:
-            StorageError: they could not be stored, and the jobs are as they were.
+            StorageError: they could not be stored, the jobs are as they were, and none is new.
         """
+        self._put_new(added)
         before = [self._jobs[job.seq] for job in jobs]
         for job in jobs:
             self._put(job)
             self._changing[job.seq] = job
         self._pay_debts()
-        future = self._store.update(jobs, now_us(), actor)
-        future.add_done_callback(partial(self._settled, jobs, before))  # As in `add`.
+        future = self._store.update(jobs, now_us(), actor, added)
+        future.add_done_callback(partial(self._added, added))  # As in `add`.
+        future.add_done_callback(partial(self._settled, jobs, before))
         await asyncio.shield(future)
 
     def explain(self, job: Job, reason: Reason) -> None:
@@ -179,6 +177,13 @@ class Ledger:
         """End every job that has not ended and does not just wait in the queue, as `declare`."""
         at_us = now_us()
         return [self.declare(job.to(state, reason, at_us), actor) for job in self.called]
+
+    def _put_new(self, jobs: Sequence[Job]) -> None:
+        for job in jobs:
+            self._unsaved.add(job.seq)
+            self._put(job)
+        if any(job.seq % _TRIM_EVERY == 0 for job in jobs):
+            self._store.trim(self._machine, self._keep_stored)
 
     def _added(self, jobs: Sequence[Job], future: "asyncio.Future[None]") -> None:
         failed = future.cancelled() or future.exception() is not None

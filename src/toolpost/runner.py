@@ -70,7 +70,9 @@ class Runner:
             return
         try:
             # The intent to start is on disk before the first byte leaves: a start happens at most once.
-            if self._is(job, JobState.PENDING) and self._driver.ready and await self._commit_start(job):
+            present = self._ledger.next
+            still = present is not None and present.seq == job.seq and self._driver.ready
+            if still and await self._commit_start(job):
                 await self._execute(job, reader)
         finally:
             reader.close()

@@ -4,7 +4,7 @@ import importlib
 
 import click
 
-import toolpost
+from toolpost.version import VERSION
 
 _COMMANDS = ("demo", "key", "serve", "sim")
 
@@ -24,6 +24,6 @@ class _Commands(click.Group):
 
 
 @click.group(cls=_Commands)
-@click.version_option(toolpost.__version__, prog_name="toolpost")
+@click.version_option(VERSION, prog_name="toolpost")
 def main() -> None:
     """Toolpost: a job server for G-code machines."""

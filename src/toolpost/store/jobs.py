@@ -31,16 +31,18 @@ class JobStore:
         """Store new jobs; the future is done when all are on disk, or fails with StorageError."""
 
         def apply(connection: sqlite3.Connection) -> None:
-            connection.executemany(QUERIES["insert_job"], [_row(job) for job in jobs])
-            events = [_event(job, job.created_us, actor) for job in jobs]
-            connection.executemany(QUERIES["insert_event"], events)
+            _insert(connection, jobs, actor)
 
         return self._database.submit(apply)
 
-    def update(self, jobs: Sequence[Job], at_us: int, actor: str) -> "asyncio.Future[None]":
-        """Store what has become of jobs, as `add`."""
+    def update(
+        self, jobs: Sequence[Job], at_us: int, actor: str, added: Sequence[Job] = ()
+    ) -> "asyncio.Future[None]":
+        """Store what has become of jobs, and new ones together with it: all of it or nothing. As `add`."""
 
         def apply(connection: sqlite3.Connection) -> None:
+            if added:
+                _insert(connection, added, actor)
             connection.executemany(QUERIES["update_job"], [_row(job) for job in jobs])
             connection.executemany(QUERIES["insert_event"], [_event(job, at_us, actor) for job in jobs])
 
@@ -64,6 +66,11 @@ class JobStore:
     def programs_in_use(self) -> set[str]:
         """Return the hashes of the programs that jobs not ended refer to."""
         return {row[0] for row in self._database.read("programs_in_use")}
+
+
+def _insert(connection: sqlite3.Connection, jobs: Sequence[Job], actor: str) -> None:
+    connection.executemany(QUERIES["insert_job"], [_row(job) for job in jobs])
+    connection.executemany(QUERIES["insert_event"], [_event(job, job.created_us, actor) for job in jobs])
 
 
 def _row(job: Job) -> dict[str, Any]:

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import msgspec
 
-import toolpost
 from toolpost.core.machine import LinkState
 from toolpost.dialects.moonraker.connections import Connection, Connections
 from toolpost.dialects.moonraker.rpc import Method, NoParams
 from toolpost.events import Event, MachineChanged
 from toolpost.shop import Shop
+from toolpost.version import VERSION
 
 API_VERSION = (1, 5, 0)
 COMPONENTS = ("job_queue", "klippy_connection")
@@ -97,7 +97,7 @@ class InfoMethods:
             registered_directories=("gcodes",),
             warnings=(),
             websocket_count=len(self._connections),
-            moonraker_version=f"toolpost-{toolpost.__version__}",
+            moonraker_version=f"toolpost-{VERSION}",
             missing_klippy_requirements=(),
             api_version=API_VERSION,
             api_version_string=".".join(map(str, API_VERSION)),
@@ -110,7 +110,7 @@ class InfoMethods:
             state="error" if state == "disconnected" else state,
             state_message=message,
             hostname=socket.gethostname(),
-            software_version=f"toolpost-{toolpost.__version__}",
+            software_version=f"toolpost-{VERSION}",
             cpu_info=f"{os.cpu_count()} core {platform.machine()}",
             python_path=str(Path(sys.executable)),
             process_id=os.getpid(),

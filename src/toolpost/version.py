@@ -1,0 +1,3 @@
+"""The version of Toolpost."""
+
+VERSION = "0.1.0"
