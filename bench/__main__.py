@@ -8,10 +8,10 @@ import click
 import msgspec
 import uvloop
 
-from bench import latency, load, stream, telemetry
+from bench import latency, load, queue, stream, telemetry
 from bench.result import Result, show
 
-_PARTS = ("stream", "latency", "load", "telemetry")
+_PARTS = ("stream", "latency", "load", "queue", "telemetry")
 
 
 @click.command()
@@ -28,6 +28,8 @@ def main(parts: tuple[str, ...], scale: float, file: Path | None) -> None:
         results += uvloop.run(latency.measure(scale))
     if "load" in parts:
         results += uvloop.run(load.measure(scale))
+    if "queue" in parts:
+        results += uvloop.run(queue.measure(scale))
     if "telemetry" in parts:
         results += msgspec.convert(telemetry.measure(int(10_000_000 * scale)), list[Result])
     when = dt.datetime.now(dt.UTC).strftime("%Y-%m-%d")

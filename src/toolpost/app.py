@@ -96,7 +96,7 @@ class App:
         )
         # Jobs run from their programs; what is kept of the files only spares reading them again.
         await files.trim(set(), self._config.storage.programs_bytes)
-        shop = Shop(machines, store, telemetry, files, self._config.storage.programs_bytes)
+        shop = Shop(machines, store, telemetry, files, self._config.storage.programs_bytes, self._main[0])
         moonrakers = {name: Moonraker(shop, name, events) for name in machines}
         for moonraker in moonrakers.values():
             opened.callback(moonraker.close)

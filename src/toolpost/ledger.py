@@ -157,6 +157,17 @@ class Ledger:
         future.add_done_callback(partial(self._settled, jobs, before))
         await asyncio.shield(future)
 
+    async def delete(self, jobs: Sequence[Job]) -> None:
+        """Forget jobs that have ended; they are gone from the disk when this returns.
+
+        Raises:
+            StorageError: it could not be stored, and they are still there.
+        """
+        self._pay_debts()
+        future = self._store.delete([job.seq for job in jobs])
+        future.add_done_callback(partial(self._deleted, jobs))  # As in `add`.
+        await asyncio.shield(future)
+
     def explain(self, job: Job, reason: Reason) -> None:
         """Say why a pending job waits; it changes with the machine, so it is not stored."""
         job = self._jobs.get(job.seq, job)
@@ -196,6 +207,12 @@ class Ledger:
                 self._called.pop(job.seq, None)
         for job in () if failed else jobs:
             self._changed(self._jobs.get(job.seq, job))
+
+    def _deleted(self, jobs: Sequence[Job], future: "asyncio.Future[None]") -> None:
+        if not future.cancelled() and future.exception() is None:
+            for job in jobs:
+                self._jobs.pop(job.seq, None)
+                self._debts.pop(job.seq, None)
 
     def _settled(self, jobs: Sequence[Job], before: Sequence[Job], future: "asyncio.Future[None]") -> None:
         failed = future.cancelled() or future.exception() is not None

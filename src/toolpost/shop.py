@@ -6,11 +6,12 @@ from collections.abc import Iterable, Iterator, Sequence
 import msgspec
 
 from toolpost.clock import now_us
+from toolpost.config import Address, QueueConfig
 from toolpost.core.grid import SampleGrid
 from toolpost.core.job import Job, JobState, Reason
-from toolpost.core.machine import LinkState
+from toolpost.core.machine import LinkState, MachineState
 from toolpost.core.program import Program
-from toolpost.core.queue import QueueView
+from toolpost.core.queue import QueueState, QueueView
 from toolpost.core.report import Report, Value
 from toolpost.drivers.base import LineKind
 from toolpost.errors import InvalidLineError, InvalidRequestError, NotAcceptedError, StorageError
@@ -19,6 +20,7 @@ from toolpost.gcode.reader import read_lines
 from toolpost.machine import Machine
 from toolpost.store import Store
 from toolpost.store.files import Files
+from toolpost.store.namespaces import NamespaceStore
 from toolpost.telemetry import Telemetry
 
 _READERS = 4
@@ -58,6 +60,7 @@ class Shop:
         telemetry: the reports.
         files: the ``gcodes`` root.
         programs_bytes: bound of the programs that no job needs.
+        address: where the server listens first of all, as it is configured.
     """
 
     def __init__(
@@ -67,6 +70,7 @@ class Shop:
         telemetry: Telemetry,
         files: Files,
         programs_bytes: int,
+        address: Address | None = None,
     ) -> None:
         self._machines = machines
         self._programs = store.programs
@@ -74,6 +78,8 @@ class Shop:
         self._telemetry = telemetry
         self._programs_bytes = programs_bytes
         self._files = files
+        self._namespaces = store.namespaces
+        self._address = address
         self._made: dict[tuple[str, str], Program] = {}
         # Each may make a large answer: so many at a time, whatever is asked.
         self._readers = asyncio.Semaphore(_READERS)
@@ -89,6 +95,16 @@ class Shop:
     def files(self) -> Files:
         """The ``gcodes`` root, which all machines share."""
         return self._files
+
+    @property
+    def namespaces(self) -> NamespaceStore:
+        """What clients keep here for themselves; all machines share it."""
+        return self._namespaces
+
+    @property
+    def address(self) -> Address | None:
+        """Where the server listens first of all, as it is configured."""
+        return self._address
 
     # Lines
 
@@ -121,6 +137,14 @@ class Shop:
         if urgent or line.kind is LineKind.SIGNAL:
             return target.driver.send_now(line.payload)
         return target.driver.enqueue(line.payload)
+
+    def is_stop(self, machine: str, text: str) -> bool:
+        """Whether a line stops the machine.
+
+        Raises:
+            InvalidRequestError: the line must not go to this machine.
+        """
+        return self._machines[machine].driver.line(text).kind is LineKind.STOP
 
     def check_poll(self, machine: str, text: str) -> str:
         """Return the line to send at intervals that `text` stands for.
@@ -174,6 +198,44 @@ class Shop:
         self._trim_programs()
         return target.ledger.get(job.seq) or job
 
+    async def print_file(self, machine: str, name: str, *, actor: str) -> Job:
+        """Run a file now, ahead of the queue; the job is on disk when this returns.
+
+        Args:
+            machine: name of the machine.
+            name: a file in the ``gcodes`` root; what it holds now is what will run.
+            actor: who asks.
+
+        Raises:
+            FileMissingError, InvalidRequestError: it is not there or no program for this machine.
+            NotAcceptedError: the machine is busy or does not answer.
+            StorageError: it could not be stored, and there is no such job.
+        """
+        target = self._machines[machine]
+        self._check_free(target)
+        cancels = self._cancels[machine]
+        self._adding[machine] += 1
+        try:
+            file = await self._files.pin(name)
+            program = await asyncio.to_thread(self._program_of, target, name, file)
+            if self._cancels[machine] != cancels:
+                raise NotAcceptedError("everything was canceled meanwhile")
+            self._check_free(target, adding=1)
+            job = target.ledger.new(program, {}, name=name)
+            await target.ledger.add([job], actor)
+        finally:
+            self._adding[machine] -= 1
+        return target.ledger.get(job.seq) or job
+
+    def _check_free(self, target: Machine, adding: int = 0) -> None:
+        """NotAcceptedError if a job could not start at once; `adding` are being added by the caller."""
+        if target.ledger.called or self._adding[target.name] > adding:
+            raise NotAcceptedError("a job has not ended")
+        if target.queue.view.state in {QueueState.LOADING, QueueState.STARTING}:
+            raise NotAcceptedError("the queue is loading a job")
+        if not target.driver.accepting:
+            raise NotAcceptedError("the machine does not answer")
+
     async def cancel(self, machine: str, actor: str) -> None:
         """Stop a machine, cancel every job that runs or is about to, and pause its queue.
 
@@ -194,6 +256,25 @@ class Shop:
     def jobs(self, machine: str) -> list[Job]:
         """Return a machine's jobs in the order of adding."""
         return list(self._machines[machine].ledger)
+
+    def active_job(self, machine: str) -> Job | None:
+        """Return the job that holds the machine."""
+        return self._machines[machine].ledger.active
+
+    def job(self, machine: str, seq: int) -> Job | None:
+        """Return a job as it is now; None if it is not kept in memory."""
+        return self._machines[machine].ledger.get(seq)
+
+    async def delete_jobs(self, machine: str, jobs: Sequence[Job]) -> None:
+        """Forget jobs that have ended.
+
+        Raises:
+            NotAcceptedError: one has not ended.
+            StorageError: it could not be stored, and they are still there.
+        """
+        if not all(job.ended for job in jobs):
+            raise NotAcceptedError("a job that has not ended cannot be deleted")
+        await self._machines[machine].ledger.delete(jobs)
 
     def progress(self, job: Job) -> Progress | None:
         """Return how far a job is; None if that is not known, as of a job that did not end well."""
@@ -225,6 +306,10 @@ class Shop:
         )
 
     # The queue
+
+    def queue_config(self, machine: str) -> QueueConfig:
+        """Return the options of a machine's queue."""
+        return self._machines[machine].config.queue
 
     def queue(self, machine: str) -> QueueView:
         """Return a machine's queue."""
@@ -300,6 +385,10 @@ class Shop:
         self._made[key] = program
         return program
 
+    def state(self, machine: str) -> MachineState:
+        """Return a machine as it is known now."""
+        return self._machines[machine].driver.state
+
     def link(self, machine: str) -> LinkState:
         """Return the state of a machine's link."""
         return self._machines[machine].driver.state.link
@@ -324,6 +413,10 @@ class Shop:
         await target.set_init_lines([line.strip() for line in lines if line.strip()])
 
     # Telemetry
+
+    def latest(self, machine: str, tag: str) -> Report | None:
+        """Return the latest report of a tag, which may be from before a restart."""
+        return self._telemetry.latest(machine, tag)
 
     async def reports(self, machine: str, tag: str, count: int) -> list[Report]:
         """Return the latest reports of a tag, the latest first."""

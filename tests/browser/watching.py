@@ -1,17 +1,18 @@
-"""What the browser tests stand on: a static site, and a watch over a page."""
+"""What the browser tests stand on: a static site, and watches over what a page does."""
 
 import contextlib
 import functools
 import http.server
+import json
 import os
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
-from playwright.sync_api import ConsoleMessage, Page, Request, Response
+from playwright.sync_api import ConsoleMessage, Page, Request, Response, WebSocket
 
 CHROMIUM_FLAGS = [
     "--headless",
@@ -34,8 +35,19 @@ def port_taken(port: int) -> bool:
 
 
 class _Files(http.server.SimpleHTTPRequestHandler):
+    def __init__(self, *args: Any, instead: Mapping[str, bytes], **kwargs: Any) -> None:
+        self._instead = instead
+        super().__init__(*args, **kwargs)
+
     def do_GET(self) -> None:
-        if self.path == "/favicon.ico":
+        if self.path in self._instead:
+            body = self._instead[self.path]
+            self.send_response(200)
+            self.send_header("Content-Type", self.guess_type(self.path))
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+        elif self.path == "/favicon.ico":
             self.send_response(204)
             self.end_headers()
         else:
@@ -46,10 +58,15 @@ class _Files(http.server.SimpleHTTPRequestHandler):
 
 
 class StaticSite:
-    """Serves a folder on a free port of 127.0.0.1 from a thread, until closed."""
+    """Serves a folder on a free port of 127.0.0.1 from a thread, until closed.
 
-    def __init__(self, folder: Path) -> None:
-        handler = functools.partial(_Files, directory=os.fspath(folder))
+    Args:
+        folder: what it serves.
+        instead: bodies that are served in the place of files, by their paths.
+    """
+
+    def __init__(self, folder: Path, instead: Mapping[str, bytes] | None = None) -> None:
+        handler = functools.partial(_Files, directory=os.fspath(folder), instead=instead or {})
         self._server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
         self.origin = f"http://127.0.0.1:{self._server.server_port}"
@@ -132,3 +149,62 @@ class Watch:
             if response.request.method == "POST" and response.url.endswith(path):
                 answer = response.json() if response.ok else response.text()
                 found.append((response.request.post_data_json, answer))
+
+
+class Call(NamedTuple):
+    """A JSON-RPC call of a page, and its answer."""
+
+    method: str
+    params: Any
+    result: Any
+    error: Any
+
+
+class RpcWatch:
+    """Notes the JSON-RPC 2.0 that a page speaks over its WebSockets."""
+
+    def __init__(self, page: Page) -> None:
+        self.calls: list[Call] = []
+        """Those that were answered, in the order of their answers."""
+        self.notifications: list[tuple[str, Any]] = []
+        """Method and params of each."""
+        self.closed = 0
+        """WebSockets that have been closed, by whichever side."""
+        self._asked: dict[tuple[WebSocket, Any], tuple[str, Any]] = {}
+        page.on("websocket", self._opened)
+
+    def unanswered(self) -> list[tuple[str, Any]]:
+        """Method and params of each call that waits for its answer."""
+        return list(self._asked.values())
+
+    def of(self, method: str) -> list[Call]:
+        """The answered calls of a method."""
+        return [call for call in self.calls if call.method == method]
+
+    def _opened(self, socket: WebSocket) -> None:
+        socket.on("framesent", lambda payload: self._sent(socket, payload))
+        socket.on("framereceived", lambda payload: self._received(socket, payload))
+        socket.on("close", self._close)
+
+    def _close(self, socket: WebSocket) -> None:
+        self.closed += 1
+        for key in [key for key in self._asked if key[0] is socket]:
+            del self._asked[key]
+
+    def _sent(self, socket: WebSocket, payload: str | bytes) -> None:
+        for message in _messages(payload):
+            self._asked[socket, message["id"]] = message["method"], message.get("params")
+
+    def _received(self, socket: WebSocket, payload: str | bytes) -> None:
+        for message in _messages(payload):
+            if "method" in message:
+                self.notifications.append((message["method"], message.get("params")))
+            else:
+                method, params = self._asked.pop((socket, message["id"]), ("", None))
+                self.calls.append(Call(method, params, message.get("result"), message.get("error")))
+
+
+def _messages(payload: str | bytes) -> list[dict[str, Any]]:
+    """One message or a batch."""
+    data = json.loads(payload)
+    return data if isinstance(data, list) else [data]

@@ -1,10 +1,11 @@
-"""What must outlive the process: jobs, programs, settings and keys."""
+"""What must outlive the process: jobs, programs, settings, keys and what clients keep here."""
 
 from pathlib import Path
 
 from toolpost.store.database import Database
 from toolpost.store.jobs import JobStore
 from toolpost.store.keys import KeyStore
+from toolpost.store.namespaces import NamespaceStore
 from toolpost.store.programs import ProgramStore
 from toolpost.store.settings import SettingStore
 
@@ -25,6 +26,7 @@ class Store:
             self.jobs = JobStore(self._database)
             self.settings = SettingStore(self._database)
             self.keys = KeyStore(self._database)
+            self.namespaces = NamespaceStore(self._database)
             self.programs = ProgramStore(directory / "programs")
         except BaseException:
             self._database.close()

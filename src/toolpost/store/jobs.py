@@ -48,6 +48,14 @@ class JobStore:
 
         return self._database.submit(apply)
 
+    def delete(self, seqs: Sequence[int]) -> "asyncio.Future[None]":
+        """Delete jobs that have ended, as `add`; their sequence numbers are not used again."""
+
+        def apply(connection: sqlite3.Connection) -> None:
+            connection.executemany(QUERIES["delete_job"], [{"seq": seq} for seq in seqs])
+
+        return self._database.submit(apply)
+
     def trim(self, machine: str, keep: int) -> "asyncio.Future[None]":
         """Delete the oldest ended jobs of a machine but the `keep` newest jobs."""
 

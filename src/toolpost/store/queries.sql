@@ -34,6 +34,9 @@ WHERE machine = :machine
   AND state IN ('canceled', 'aborted', 'completed')
   AND seq <= (SELECT seq FROM job WHERE machine = :machine ORDER BY seq DESC LIMIT 1 OFFSET :keep);
 
+-- name: delete_job
+DELETE FROM job WHERE seq = :seq AND state IN ('canceled', 'aborted', 'completed');
+
 -- name: programs_in_use
 SELECT DISTINCT program FROM job
 WHERE state IN ('pending', 'pending-held', 'processing', 'processing-stopped');
@@ -53,3 +56,22 @@ DELETE FROM api_key WHERE name = :name;
 
 -- name: keys
 SELECT name, sha256, created_us FROM api_key ORDER BY name;
+
+-- name: namespaces
+SELECT DISTINCT namespace FROM namespace_item ORDER BY namespace;
+
+-- name: namespace_items
+SELECT key, value FROM namespace_item WHERE namespace = :namespace ORDER BY key;
+
+-- name: namespace_item
+SELECT value FROM namespace_item WHERE namespace = :namespace AND key = :key;
+
+-- name: namespace_totals
+SELECT COUNT(*), COUNT(DISTINCT namespace), COALESCE(SUM(size), 0) FROM namespace_item;
+
+-- name: set_namespace_item
+INSERT INTO namespace_item (namespace, key, size, value) VALUES (:namespace, :key, :size, :value)
+ON CONFLICT (namespace, key) DO UPDATE SET size = excluded.size, value = excluded.value;
+
+-- name: delete_namespace_item
+DELETE FROM namespace_item WHERE namespace = :namespace AND key = :key;

@@ -26,7 +26,7 @@ FILES = {
     "range.gcode": ["G28", *(["G1 X9999 F6000"] * 40)],
     "tiny.gcode": ["M118 hi"],
 }
-"""The files of the recording; those that fail on Klipper are long enough for the machine to fail meanwhile."""
+"""The files of the recording; those that fail on Klipper are long enough for a machine to fail meanwhile."""
 
 
 def config(*machines: tuple[str, str], server: str = "") -> str:
@@ -35,12 +35,14 @@ def config(*machines: tuple[str, str], server: str = "") -> str:
     return f'[server]\nlisten = "127.0.0.1:0"\n{server}\n' + "".join(tables)
 
 
-def machine(name: str, link: str = "sim", *, command_time: float = 0.0, **queue: Any) -> tuple[str, str]:
+def machine(
+    name: str, link: str = "sim", *, command_time: float = 0.0, hold_off: float = 0.05, **queue: Any
+) -> tuple[str, str]:
     """A machine for `config`; `queue` are the options of its queue."""
     options = "".join(f"{key} = {json.dumps(value)}\n" for key, value in queue.items())
-    tables = {"spark": "hold_off = 0.05\n", "queue": options}
+    tables = {"spark": f"hold_off = {hold_off}\n", "queue": options}
     if link == "sim":
-        tables["sim"] = f"command_time = {command_time}\nhold_off = 0.05\n"
+        tables["sim"] = f"command_time = {command_time}\nhold_off = {hold_off}\n"
     subtables = "".join(f"[machines.{name}.{table}]\n{text}" for table, text in tables.items())
     return name, f'link = "{link}"\n{subtables}'
 

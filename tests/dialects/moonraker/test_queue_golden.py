@@ -6,22 +6,38 @@ part from its first record to its last. What deliberately differs stands in the 
 
 import asyncio
 import contextlib
+import itertools
 import json
+import signal
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
-from tests.dialects.moonraker.live import config, ids, machine, names, site, write_files
+from tests.dialects.moonraker.live import (
+    FILES,
+    NOTIFICATION,
+    QUEUE,
+    Watcher,
+    brief,
+    config,
+    ids,
+    machine,
+    names,
+    shop_idle,
+    site,
+    until,
+    watching,
+    write_files,
+)
 from tests.dialects.moonraker.serving import Client, Site
-from tests.harness import Server
+from tests.harness import JSON, Port, Server
+
+from toolpost.sim.options import SparkOptions
 
 GOLDEN = Path(__file__).parents[2] / "golden" / "moonraker.jsonl"
-SECTIONS = {"A-http-idle", "B-rpc-ws", "B-rpc-http"}
-RECORDS = [
-    record
-    for line in GOLDEN.read_text("utf-8").splitlines()
-    if (record := json.loads(line))["section"] in SECTIONS
-]
+ALL = [json.loads(line) for line in GOLDEN.read_text("utf-8").splitlines()]
+RECORDS = [record for record in ALL if record["section"].startswith(("A-", "B-"))]
+DYNAMIC = {record["seq"]: record for record in ALL if record["section"].startswith(("C-", "F-"))}
 NO_BOOL = "Unable to convert argument [reset] to <class 'bool'>: value received: {}"
 NO_STR = "Unable to convert argument [job_id] to <class 'str'>: value received: {}"
 NO_GCODE = "{!r}: not a G-code file; its name must end with one of .gcode, .g, .gco"
@@ -170,9 +186,7 @@ class Replay:
             answer = await self._where.rpc_http(self.body)
         else:
             path = self.own(request["path"])
-            answer = await self._where.http(
-                request["method"], path, self.body, request.get("headers") or {}
-            )
+            answer = await self._where.http(request["method"], path, self.body, request.get("headers") or {})
         head = (answer.status, answer.headers.get("content-type"), "etag" in answer.headers)
         is_json = (head[1] or "").startswith("application/json")
         return head, answer.json if answer.body and is_json else answer.body.decode()
@@ -229,7 +243,7 @@ def test_replayed(bench: tuple[asyncio.Runner, Site, Client, Client], record: di
         assert loose(content) == loose(expected)
         assert head == expected_head
         await watcher.call("server.websocket.id")
-        seen = [message["params"] for message in watcher.notifications]
+        seen = [note["params"] for note in watcher.notifications if note["method"] == NOTIFICATION]
         recorded = [message["params"] for message in record["notifications"]]
         if record["seq"] in NOTIFIED:
             assert len(seen) == NOTIFIED[record["seq"]][0] != len(recorded)
@@ -239,6 +253,356 @@ def test_replayed(bench: tuple[asyncio.Runner, Site, Client, Client], record: di
     runner.run(replay())
 
 
-def test_the_differences_are_of_records_that_there_are() -> None:
+class Part(NamedTuple):
+    """Some records of C in their order, on a queue that is empty before.
+
+    Attributes:
+        first, last: of the records.
+        answers: what is answered to some of them instead, as ``state [names]``; several are possible where
+            the recorded one shows how long the original took.
+        events: what is told instead of the recorded notifications.
+        why: of each difference.
+    """
+
+    first: int
+    last: int
+    answers: dict[int, tuple[str, ...]] = {}  # noqa: RUF012  # a tuple cannot be changed
+    events: list[str] | None = None
+    why: tuple[str, ...] = ()
+
+
+NO_READY_BEFORE = "the original was left 'ready' with an empty queue by what came before (1.5)"
+NO_TICK = "what waited for a tick of Klipper's has happened already"
+CONTENT_KEPT = "1.6, 6: a job runs what its file held when it was queued, whatever happens to the file"
+NOTHING_LEFT = "1.7: 'ready' with nothing left to load becomes 'paused', so that it means what it says"
+
+PARTS = {
+    "two jobs": Part(
+        290,
+        294,
+        {
+            290: ("paused [a.gcode b.gcode]",),
+            292: ("loading [a.gcode b.gcode]", "starting [a.gcode b.gcode]", "ready [b.gcode]"),
+        },
+        [
+            "jobs_added paused [a.gcode b.gcode]",
+            "state_changed loading",
+            "state_changed starting",
+            "job_loaded ready [b.gcode]",
+            "state_changed loading",
+            "state_changed starting",
+            "job_loaded paused []",
+        ],
+        (NO_READY_BEFORE, NO_TICK),
+    ),
+    "a direct job": Part(295, 301),
+    "no start by itself": Part(302, 303),
+    "cancel": Part(304, 311),
+    "a job fails": Part(312, 318),
+    "the last job fails": Part(319, 322),
+    "a file is deleted": Part(
+        323,
+        328,
+        {328: ("paused []",)},
+        [
+            "jobs_added paused [gone.gcode a.gcode]",
+            "state_changed loading",
+            "state_changed starting",
+            "job_loaded ready [a.gcode]",
+            "state_changed loading",
+            "state_changed starting",
+            "job_loaded paused []",
+        ],
+        (CONTENT_KEPT,),
+    ),
+    "delete all while a job runs": Part(
+        346,
+        351,
+        dict.fromkeys([348, 349, 351], ("paused []",)),
+        [
+            "jobs_added paused [mid.gcode a.gcode]",
+            "state_changed loading",
+            "state_changed starting",
+            "job_loaded ready [a.gcode]",
+            "state_changed paused",
+            "jobs_removed paused []",
+        ],
+        (NOTHING_LEFT,),
+    ),
+    "five starts at once": Part(
+        352,
+        359,
+        {
+            352: ("paused [a.gcode b.gcode a.gcode]",),
+            **dict.fromkeys(
+                range(353, 358),
+                (
+                    "loading [a.gcode b.gcode a.gcode]",
+                    "starting [a.gcode b.gcode a.gcode]",
+                    "ready [b.gcode a.gcode]",
+                ),
+            ),
+        },
+        [
+            "jobs_added paused [a.gcode b.gcode a.gcode]",
+            "state_changed loading",
+            "state_changed starting",
+            "job_loaded ready [b.gcode a.gcode]",
+            "state_changed loading",
+            "state_changed starting",
+            "job_loaded ready [a.gcode]",
+            "state_changed loading",
+            "state_changed starting",
+            "job_loaded paused []",
+        ],
+        (NO_READY_BEFORE, NO_TICK),
+    ),
+    "shutdown": Part(365, 378),
+}
+
+NOT_REPLAYED = {
+    range(286, 290): "test_names_that_are_missing",
+    range(329, 333): "a traversal is refused when it is queued: records 186 and 258",
+    range(333, 341): "PAUSE is Klipper's: a job of a Spark core is not paused",
+    range(341, 346): "remote methods are Klipper's; test_queue_clients.py pauses a load in other ways",
+    range(360, 365): "print/start of a file that is missing or while the machine is busy: not the queue",
+    range(413, 428): "test_without_automatic_transition",
+}
+"""Records of C and F that are replayed elsewhere or nowhere."""
+
+HOLD_OFF = 0.05
+FAULTS = {"err.gcode": "reboot", "range.gcode": "reboot"}
+"""How a job fails that Klipper ends with an error: the machine loses it."""
+
+
+@pytest.fixture(scope="module")
+def workshop(tmp_path_factory: pytest.TempPathFactory):
+    """A server on a core that can have faults; each command takes 50 ms."""
+    folder = tmp_path_factory.mktemp("workshop")
+    with Port(SparkOptions(command_time=0.05, hold_off=HOLD_OFF)) as port:
+        server = Server(
+            folder, config(machine("edm", port.path, hold_off=HOLD_OFF, automatic_transition=True))
+        )
+        write_files(server.data)
+        with server:
+            yield server, port
+
+
+@pytest.mark.parametrize("part", PARTS.values(), ids=PARTS)
+def test_replayed_part(workshop: tuple[Server, Port], part: Part) -> None:
+    async def run() -> None:
+        server, port = workshop
+        where = site(server)
+        write_files(server.data)
+        await where.http("DELETE", f"{QUEUE}/job?all=true")
+        await idle(where)
+        # Nothing is started, but a pause that was asked for before is forgotten.
+        await where.http("POST", f"{QUEUE}/start")
+        records = [DYNAMIC[seq] for seq in range(part.first, part.last + 1)]
+        async with watching(where) as watcher:
+            replay = PartReplay(part, server, port, where, watcher)
+            for _, group in itertools.groupby(records, key=lambda record: record["name"]):
+                # Those of one name were sent at the same moment.
+                await asyncio.gather(*map(replay.step, group))
+            told = [brief(event) for record in records for event in events(record)]
+            expected = part.events or told
+            await until(lambda: len(watcher.events) >= len(expected))
+            await asyncio.sleep(0.05)
+            assert watcher.brief == expected
+            assert part.events is None or part.why
+
+    asyncio.run(run())
+
+
+class PartReplay:
+    """Does what a record did, in the words of a Spark core where they are Klipper's, and compares."""
+
+    def __init__(self, part: Part, server: Server, port: Port, where: Site, watcher: Watcher) -> None:
+        self._part = part
+        self._data = server.data
+        self._port = port
+        self._where = where
+        self._watcher = watcher
+        self._ids: dict[str, str] = {}
+        self._running = ""
+        self._failed = False
+
+    async def step(self, record: dict[str, Any]) -> None:
+        request = record["request"]
+        path, _, query = (request.get("path") or "").partition("?")
+        loaded = self._watcher.count("job_loaded")
+        if request["method"] == "WATCH":
+            await self._watch()
+        elif path.startswith(QUEUE):
+            await self._queue(record)
+        elif path == "/printer/print/start":
+            job = {"commands": FILES[query.removeprefix("filename=")][:-1] * 2}
+            answer = await self._where.http("POST", "/add-job", json.dumps(job).encode(), JSON)
+            assert answer.json["ok"] == (record["response"]["status"] == 200)
+        elif path == "/printer/print/cancel":
+            assert (await self._where.http("POST", "/cancel", b"{}", JSON)).status == 200
+            # The core takes nothing for a moment; with Klipper, a cancel is answered after that.
+            await asyncio.sleep(2 * HOLD_OFF)
+        elif path == "/printer/emergency_stop":
+            self._port.inject("fault")
+            await until(lambda: "notify_klippy_shutdown" in self._watcher.others)
+            await until(lambda: self._watcher.events[-1]["queue_state"] == "paused")
+        elif path == "/printer/firmware_restart":
+            self._port.inject("reboot")
+            await until(lambda: "notify_klippy_ready" in self._watcher.others)
+            await asyncio.sleep(2 * HOLD_OFF)
+        elif path in {"/printer/info", "/server/info"}:
+            answer = (await self._where.http("GET", path)).json["result"]
+            recorded = record["response"]["json"]["result"]
+            for key in recorded.keys() & {"state", "klippy_state", "klippy_connected", "api_version"}:
+                assert answer[key] == recorded[key], key
+        elif request["method"] == "DELETE":
+            (self._data / "gcodes" / path.rpartition("/")[2]).unlink()
+        else:
+            assert path == "/printer/objects/query", path
+        if any(event["action"] == "job_loaded" for event in events(record)):
+            await until(lambda: self._watcher.count("job_loaded") > loaded)
+
+    async def _queue(self, record: dict[str, Any]) -> None:
+        request, response = record["request"], record["response"]
+        body = (request["body"] or "").encode()
+        answer = await self._where.http(request["method"], request["path"], body, JSON if body else {})
+        assert answer.status == response["status"]
+        queue = answer.json["result"]
+        recorded = response["json"]["result"]
+        expected = self._part.answers.get(record["seq"], (shown(recorded), *further(shown(recorded))))
+        assert shown(queue) in expected, record["seq"]
+        if shown(queue).partition(" ")[2] == shown(recorded).partition(" ")[2]:
+            for own, other in zip(ids(queue), ids(recorded), strict=True):
+                assert self._ids.setdefault(other, own) == own
+        if names(queue):
+            self._running = names(queue)[0]
+
+    async def _watch(self) -> None:
+        """Waits until nothing happens any more; a job that failed does so here."""
+        fault = FAULTS.get(self._running)
+        if fault is not None and not self._failed:
+            await until(lambda: self._watcher.count("job_loaded") > 0)
+            self._failed = True
+            self._port.inject(fault)
+            await until(lambda: not self._port.core.queue_length)
+            await idle(self._where)
+            await asyncio.sleep(2 * HOLD_OFF)
+        await idle(self._where)
+
+
+async def idle(where: Site) -> None:
+    """Returns when the machine does nothing and its queue goes on no more."""
+    async with asyncio.timeout(20):
+        while True:
+            queue = (await where.http("GET", f"{QUEUE}/status")).json["result"]
+            still = queue["queue_state"] == "paused" or (queue["queue_state"] == "ready" and not names(queue))
+            if still and await shop_idle(where):
+                return
+            await asyncio.sleep(0.01)
+
+
+def further(shown: str) -> list[str]:
+    """What a load that has begun may be in the answer already: it is answered when it is on disk."""
+    return [shown.replace("loading", "starting", 1)] if shown.startswith("loading") else []
+
+
+def events(record: dict[str, Any]) -> list[dict[str, Any]]:
+    """What was told of the queue after a recorded request."""
+    return [
+        event
+        for notification in record["notifications"]
+        if notification["method"] == NOTIFICATION
+        for event in notification["params"]
+    ]
+
+
+def shown(queue: dict[str, Any]) -> str:
+    """An answer as ``state [names]``."""
+    return f"{queue['queue_state']} [{' '.join(names(queue))}]"
+
+
+def test_names_that_are_missing(bench: tuple[asyncio.Runner, Site, Client, Client]) -> None:
+    """Records 286 to 289; the message was "Unknown" of three (1.2)."""
+    runner, where, _, _ = bench
+
+    async def run() -> None:
+        for seq in range(286, 290):
+            body = DYNAMIC[seq]["request"]["body"]
+            name = json.loads(body)["filenames"][0]
+            answer = await where.http("POST", f"{QUEUE}/job", body.encode(), JSON)
+            message = f"G-Code File {name} does not exist"
+            if "\n" in name:
+                message = f"{name!r}: a name must not contain control characters"
+            assert (answer.status, answer.json) == (400, {"error": {"code": 400, "message": message}})
+
+    runner.run(run())
+
+
+def test_without_automatic_transition(tmp_path: Path) -> None:
+    """Section F: `ready` is taken at its word where the original said `paused` (the document says `ready`).
+
+    Its Klipper was restarted, and with load_on_startup the first job ran each time. Here it is Toolpost that
+    is restarted, and the queue is still there.
+    """
+    options = {"command_time": 0.05, "load_on_startup": True}
+    server = Server(tmp_path, config(machine("edm", **options)))
+    write_files(server.data)
+
+    async def call(where: Site, seq: int) -> str:
+        request = DYNAMIC[seq]["request"]
+        body = (request["body"] or "").encode()
+        answer = await where.http(request["method"], request["path"], body, JSON if body else {})
+        return shown(answer.json["result"])
+
+    async def first() -> None:
+        where = site(server)
+        async with watching(where) as watcher:
+            assert await call(where, 413) == recorded(413) == "paused []"
+            assert await call(where, 414) == recorded(414) == "paused [mid.gcode b.gcode]"
+            assert await call(where, 415) in (recorded(415), *further(recorded(415)))
+            await until(lambda: watcher.count("job_loaded") == 1)
+            assert watcher.brief == [*map(brief, [*events(DYNAMIC[414]), *events(DYNAMIC[415])])]
+            assert await call(where, 416) == recorded(416) == "paused [b.gcode]"
+            assert await call(where, 417) == "ready [b.gcode]" != recorded(417)
+            assert await call(where, 418) == "ready [b.gcode a.gcode]" != recorded(418)
+            await until(lambda: watcher.count("job_loaded") == 2)
+            await idle(where)
+            assert await call(where, 420) == "paused [a.gcode]" != recorded(420)
+            assert watcher.brief[4:] == [
+                "state_changed ready",
+                "jobs_added ready [b.gcode a.gcode]",
+                "state_changed loading",
+                "state_changed starting",
+                "job_loaded paused [a.gcode]",
+            ]
+            assert await call(where, 424) == recorded(424) == "paused [a.gcode b.gcode]"
+
+    async def second() -> None:
+        where = site(server)
+        async with watching(where):
+            await idle(where)
+            await until_loaded(where, "paused [b.gcode]")
+            assert await call(where, 427) == recorded(427) == "paused [b.gcode]"
+
+    async def until_loaded(where: Site, state: str) -> None:
+        async with asyncio.timeout(10):
+            while await call(where, 427) != state:
+                await asyncio.sleep(0.01)
+
+    with server:
+        asyncio.run(first())
+        assert server.stop(signal.SIGKILL) != 0
+        server.start()
+        asyncio.run(second())
+
+
+def recorded(seq: int) -> str:
+    return shown(DYNAMIC[seq]["response"]["json"]["result"])
+
+
+def test_every_record_has_its_place() -> None:
     assert {*DIFFERENT, *NOTIFIED} <= {record["seq"] for record in RECORDS}
     assert len(RECORDS) == 169
+    replayed = [*NOT_REPLAYED, *(range(part.first, part.last + 1) for part in PARTS.values())]
+    assert sorted(seq for part in replayed for seq in part) == sorted(DYNAMIC)

@@ -5,12 +5,17 @@ import re
 from starlette.routing import BaseRoute, WebSocketRoute
 
 from toolpost.dialects.moonraker.connections import Connections
+from toolpost.dialects.moonraker.database import DatabaseMethods
 from toolpost.dialects.moonraker.files import FileMethods
+from toolpost.dialects.moonraker.history import HistoryMethods
 from toolpost.dialects.moonraker.http import MethodRoutes
 from toolpost.dialects.moonraker.identify import CONNECTION_METHODS
 from toolpost.dialects.moonraker.info import InfoMethods
 from toolpost.dialects.moonraker.job_queue import JobQueueMethods
+from toolpost.dialects.moonraker.objects import ObjectMethods
+from toolpost.dialects.moonraker.printer import PrinterMethods
 from toolpost.dialects.moonraker.rpc import Methods
+from toolpost.dialects.moonraker.system import SystemMethods
 from toolpost.dialects.moonraker.transfer import Transfer
 from toolpost.dialects.moonraker.websocket import WebSocketEndpoint
 from toolpost.events import Events
@@ -39,7 +44,11 @@ class Moonraker:
         queue = JobQueueMethods(shop, machine, self._connections)
         info = InfoMethods(shop, machine, self._connections)
         files = FileMethods(shop, self._connections)
-        parts = (queue, info, files)
+        system = SystemMethods(shop, machine, self._connections)
+        objects = ObjectMethods(shop, machine, self._connections)
+        printer = PrinterMethods(shop, machine, self._connections, objects.reset)
+        history = HistoryMethods(shop, machine, self._connections)
+        parts = (queue, info, files, DatabaseMethods(shop), system, objects, printer, history)
         self._methods = Methods([*CONNECTION_METHODS, *(m for part in parts for m in part.methods())])
         self._unsubscribe = [events.subscribe(part.event) for part in parts]
         self._transfer = Transfer(shop, machine, files)

@@ -20,9 +20,9 @@ from toolpost.shop import Shop
 from toolpost.version import VERSION
 
 API_VERSION = (1, 5, 0)
-COMPONENTS = ("job_queue", "klippy_connection")
+COMPONENTS = ("history", "job_queue", "klippy_connection")
 
-_STATES = {
+STATES = {
     LinkState.ONLINE: ("ready", "Printer is ready"),
     LinkState.CONNECTING: ("startup", "The machine has not answered yet"),
     LinkState.FAULT: ("shutdown", "The machine reports a fault; it needs a power cycle"),
@@ -120,11 +120,11 @@ class InfoMethods:
     def event(self, event: Event) -> None:
         """Tell all connections that the machine has come or gone."""
         if isinstance(event, MachineChanged) and event.machine == self._machine:
-            state, _ = _STATES[event.state.link]
+            state, _ = STATES[event.state.link]
             if state != self._told:
                 self._told = state
                 if state in _NOTIFICATIONS:
                     self._connections.notify(_NOTIFICATIONS[state])
 
     def _state(self) -> tuple[str, str]:
-        return _STATES[self._shop.link(self._machine)]
+        return STATES[self._shop.link(self._machine)]

@@ -1,11 +1,12 @@
 """The six calls of the job queue and its notification (moonraker_job_queue.md)."""
 
 import time
+from collections.abc import Iterable
 from typing import Any
 
 import msgspec
 
-from toolpost.clock import now_us, seconds
+from toolpost.clock import now_us
 from toolpost.core.job import Job
 from toolpost.core.queue import QueueView
 from toolpost.dialects.moonraker.connections import Connection, Connections
@@ -17,7 +18,6 @@ from toolpost.shop import Shop
 
 NOTIFICATION = "notify_job_queue_changed"
 
-_LARGE = 200
 _KEEP_FOR = 0.05
 
 
@@ -31,10 +31,18 @@ class QueuedJob(msgspec.Struct, frozen=True):
 
 
 class QueueStatus(msgspec.Struct, frozen=True):
-    """The answer of all six calls."""
+    """The answer of all six calls; its jobs are encoded already."""
 
-    queued_jobs: list[QueuedJob]
+    queued_jobs: msgspec.Raw
     queue_state: str
+
+
+class _Listed(msgspec.Struct, frozen=True):
+    """The waiting jobs as they are sent, since when (monotonic seconds), and their ids."""
+
+    at: float
+    jobs: msgspec.Raw
+    ids: frozenset[str]
 
 
 class PostJobParams(msgspec.Struct, frozen=True):
@@ -70,7 +78,7 @@ class JobQueueMethods:
         self._shop = shop
         self._machine = machine
         self._connections = connections
-        self._kept: tuple[float, msgspec.Raw] | None = None
+        self._listed: _Listed | None = None
 
     def methods(self) -> list[Method]:
         """Return the six methods."""
@@ -131,35 +139,43 @@ class JobQueueMethods:
         """Tell all connections of a change of this queue."""
         if not isinstance(event, QueueChanged) or event.machine != self._machine:
             return
-        self._kept = None
+        self._listed = None
+        if not len(self._connections):
+            return
         view = self._shop.queue(self._machine)
+        listed = self._list(view) if event.listed else None
         payload: dict[str, Any] = {
             "action": event.action.value,
-            "updated_queue": _jobs(view) if event.listed else None,
+            "updated_queue": listed.jobs if listed is not None else None,
             "queue_state": view.state.value,
         }
-        shows = frozenset(job.id for job in view.jobs) if event.listed else None
-        self._connections.notify(NOTIFICATION, payload, shows=shows)
+        self._connections.notify(NOTIFICATION, payload, shows=listed.ids if listed is not None else None)
 
-    def _answer(self, connection: Connection) -> object:
+    def _answer(self, connection: Connection) -> QueueStatus:
         view = self._shop.queue(self._machine)
+        listed = self._list(view)
         if connection.persistent:
-            connection.show(frozenset(job.id for job in view.jobs))
-        if len(view.jobs) < _LARGE:
-            return QueueStatus(_jobs(view), view.state.value)
-        # A long list is encoded once for all who ask within a moment: only the times in it differ.
+            connection.show(listed.ids)
+        return QueueStatus(listed.jobs, view.state.value)
+
+    def _list(self, view: QueueView) -> _Listed:
+        """Return the jobs, made once for all who are shown them within a moment: only ages in it differ."""
         now = time.monotonic()
-        if self._kept is None or now - self._kept[0] > _KEEP_FOR:
-            status = QueueStatus(_jobs(view), view.state.value)
-            self._kept = now, msgspec.Raw(msgspec.json.encode(status))
-        return self._kept[1]
+        if self._listed is None or now - self._listed.at > _KEEP_FOR:
+            jobs = msgspec.Raw(msgspec.json.encode(_jobs(view.jobs)))
+            self._listed = _Listed(now, jobs, frozenset([job.id for job in view.jobs]))
+        return self._listed
 
 
-def _jobs(view: QueueView) -> list[QueuedJob]:
+def _jobs(jobs: Iterable[Job]) -> list[QueuedJob]:
     now = now_us()
-    return [_job(job, now) for job in view.jobs]
-
-
-def _job(job: Job, now: int) -> QueuedJob:
-    waited = max(0, now - job.created_us)
-    return QueuedJob(job.name, job.id, seconds(job.created_us), seconds(waited))
+    # One expression, for there may be thousands of them, and each change shows them all.
+    return [
+        QueuedJob(
+            job.name,
+            job.id,
+            job.created_us / 1e6,
+            (now - job.created_us) / 1e6 if now > job.created_us else 0.0,
+        )
+        for job in jobs
+    ]

@@ -42,3 +42,14 @@ CREATE TABLE api_key (
     sha256      BLOB NOT NULL UNIQUE,
     created_us  INTEGER NOT NULL
 ) WITHOUT ROWID;
+
+CREATE TABLE namespace_item (
+    seq         INTEGER PRIMARY KEY,
+    namespace   TEXT NOT NULL,
+    key         TEXT NOT NULL,
+    size        INTEGER NOT NULL,
+    value       BLOB NOT NULL,
+    UNIQUE (namespace, key)
+);
+-- The bounds are checked on the index alone, without a look at the values.
+CREATE INDEX namespace_item_by_size ON namespace_item (namespace, size);
