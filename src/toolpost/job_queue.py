@@ -74,7 +74,8 @@ class JobQueue:
             return
         kept = msgspec.convert(stored, _Kept)
         self._pause_requested = kept.pause_requested
-        if kept.state is QueueState.READY and self._ledger.queued:
+        # Ready means that there is a job whose completion is awaited; a load that was cut off is none.
+        if kept.state is QueueState.READY and self._ledger.queued and self._ledger.called:
             self._state = self._resting = QueueState.READY
         else:
             self._remember(QueueState.PAUSED)
@@ -192,6 +193,8 @@ class JobQueue:
             self._enter(QueueState.PAUSED)
         elif self._driver.ready and not self._ledger.called:
             self._begin_load(delay=0.0, gcode="")
+            self._remember(self._resting)
+            return
         else:
             self._enter(QueueState.READY)
             # Without a job there is no completion to wait for: single commands, or the hold-off of a stop.

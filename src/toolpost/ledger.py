@@ -60,6 +60,7 @@ class Ledger:
         self._open: dict[int, Job] = {}
         self._called: dict[int, Job] = {}
         self._queued: list[Job] | None = None
+        self._random: list[str] = []
         self._changing: dict[int, Job] = {}
         self._debts: dict[int, tuple[Job, str]] = {}
         self._retry: asyncio.TimerHandle | None = None
@@ -110,12 +111,19 @@ class Ledger:
         job = next_to_start(self._called.values())
         return None if job is None or job.seq in self._unsaved or job.seq in self._changing else job
 
+    def _random_part(self) -> str:
+        """Return ten random hex digits; many are made at a time, because each call of the system counts."""
+        if not self._random:
+            digits = secrets.token_hex(5 * 256).upper()
+            self._random = [digits[at : at + 10] for at in range(0, len(digits), 10)]
+        return self._random.pop()
+
     def new(self, program: Program, signals: dict[str, float], *, name: str = "", called: bool = True) -> Job:
         """Return a new job, which is at the end of the queue once it is added."""
         seq = self._store.next_seq()
         return Job(
             seq=seq,
-            id=f"{seq:06X}{secrets.token_hex(5).upper()}",
+            id=f"{seq:06X}{self._random_part()}",
             machine=self._machine,
             program=program.sha256,
             commands=program.commands,

@@ -208,7 +208,7 @@ def test_kill_9_with_a_queue_at_work(tmp_path, kills):
 
 @pytest.mark.parametrize("auto", [True, False])
 def test_state_order_and_ids_are_back_after_a_kill(tmp_path, auto):
-    core = SparkOptions(command_time=0.05, hold_off=0.0)
+    core = SparkOptions(command_time=0.02, hold_off=0.0)
     link = tmp_path / "core"
     with Port(core, link=link) as port, Server(tmp_path, config(tmp_path, auto=auto)) as server:
         for name in "abcd":

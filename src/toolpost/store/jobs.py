@@ -77,15 +77,28 @@ class JobStore:
 
 
 def _insert(connection: sqlite3.Connection, jobs: Sequence[Job], actor: str) -> None:
-    connection.executemany(QUERIES["insert_job"], [_row(job) for job in jobs])
-    connection.executemany(QUERIES["insert_event"], [_event(job, job.created_us, actor) for job in jobs])
+    # Who added a job, and when, is in its row: there may be thousands of them at once.
+    connection.executemany(QUERIES["insert_job"], [{**_row(job), "actor": actor} for job in jobs])
 
 
 def _row(job: Job) -> dict[str, Any]:
-    row = msgspec.structs.asdict(job)
-    row["signals"] = msgspec.json.encode(job.signals).decode()
-    row["state"], row["reason"] = job.state.value, job.reason.value
-    return row
+    return {
+        "seq": job.seq,
+        "id": job.id,
+        "machine": job.machine,
+        "program": job.program,
+        "commands": job.commands,
+        "name": job.name,
+        "position": job.position,
+        "called": job.called,
+        "signals": msgspec.json.encode(job.signals).decode() if job.signals else "{}",
+        "state": job.state.value,
+        "reason": job.reason.value,
+        "detail": job.detail,
+        "created_us": job.created_us,
+        "started_us": job.started_us,
+        "ended_us": job.ended_us,
+    }
 
 
 def _job(row: tuple[Any, ...]) -> Job:

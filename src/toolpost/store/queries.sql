@@ -1,8 +1,8 @@
 -- name: insert_job
 INSERT INTO job (seq, id, machine, program, commands, name, position, called, signals, state, reason, detail,
-                 created_us, started_us, ended_us)
+                 actor, created_us, started_us, ended_us)
 VALUES (:seq, :id, :machine, :program, :commands, :name, :position, :called, :signals, :state, :reason, :detail,
-        :created_us, :started_us, :ended_us);
+        :actor, :created_us, :started_us, :ended_us);
 
 -- name: update_job
 UPDATE job

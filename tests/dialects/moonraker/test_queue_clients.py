@@ -458,7 +458,6 @@ def without_age(job: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in job.items() if key != "time_in_queue"}
 
 
-@pytest.mark.xfail(reason="the queue is ready, but nothing runs that it could wait for", strict=True)
 def test_a_load_that_is_killed_leaves_the_queue_paused(tmp_path: Path) -> None:
     """Nothing runs after the restart whose completion `ready` could wait for."""
     server = Server(tmp_path, config(machine("edm", automatic_transition=True, job_transition_delay=20.0)))

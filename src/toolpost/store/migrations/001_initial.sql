@@ -12,6 +12,7 @@ CREATE TABLE job (
     state       TEXT NOT NULL,
     reason      TEXT NOT NULL,
     detail      TEXT NOT NULL,
+    actor       TEXT NOT NULL,
     created_us  INTEGER NOT NULL,
     started_us  INTEGER,
     ended_us    INTEGER
