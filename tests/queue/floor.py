@@ -159,8 +159,11 @@ class Floor:
         await self.shop.cancel(NAME, "me")
 
     async def submit(self, *lines: str) -> Job:
-        """Run lines past the queue, as the spooler does."""
-        return await self.shop.submit(NAME, [lines], {}, actor="me")
+        """Have a job past the queue, as one that the shop took a moment before it would refuse it."""
+        program = self.store.programs.add([[line.encode() for line in lines]])
+        job = self.machine.ledger.new(program, {})
+        await self.machine.ledger.add([job], "me")
+        return job
 
     # What is to be seen.
 
@@ -193,7 +196,7 @@ class Floor:
 
     @property
     def running(self) -> str | None:
-        """The id of the job that holds the machine, once its first command has arrived."""
+        """The id of the job that holds the machine."""
         active = self.machine.ledger.active
         return active.id if active is not None else None
 

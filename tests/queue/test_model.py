@@ -194,8 +194,8 @@ class QueueMachine(RuleBasedStateMachine):
                     old.remove(found)
                 order.append(found)
             assert not list(fresh)
+            self.model.queue = [*order, *old]
             self.model.remove(old)
-            self.model.queue = order
             self.model.post([])
 
         self.run(main())

@@ -300,8 +300,8 @@ async def load_after_a_job(shop, *names):
     ids = await shop.post(*names)
     await shop.start()
     shop.permit(1)
-    await shop.until(lambda: shop.state == "loading")
-    await shop.until(lambda: shop.history[job.id] == "completed done")
+    await shop.until(lambda: "loading" in shop.states)
+    assert shop.history[job.id] == "completed done"
     return ids
 
 
@@ -392,6 +392,7 @@ async def test_a_jump_in_loading_is_honoured(shop):
     await shop.jump(b)
     assert (shop.state, shop.ids) == ("loading", [b, a])
     await shop.until(lambda: shop.running == b)
+    await shop.settled()
     assert shop.ids == [a]
 
 

@@ -268,6 +268,10 @@ def test_scripts(bench: Bench):
             refused = await shown.call("printer.gcode.script", script="G1 X1\nG1 X\u20ac")
             assert refused["code"] == 400
             assert "must be printable ASCII" in refused["message"]
+            for macro in ("SAVE_GCODE_STATE NAME=a\nG91\nG1 X10", "G1 X1\n_CLIENT_LINEAR_MOVE X=10"):
+                refused = await shown.call("printer.gcode.script", script=macro)
+                assert refused["code"] == 400
+                assert "nothing was sent" in refused["message"]
             refused = await shown.call("printer.gcode.script", script="G1 X1\n" * 1001)
             assert refused["code"] == 400
             assert (await shown.call("printer.gcode.script"))["message"] == "No data for argument: script"

@@ -479,3 +479,12 @@ def test_a_load_that_is_killed_leaves_the_queue_paused(tmp_path: Path) -> None:
         server.stop(signal.SIGKILL)
         server.start()
         asyncio.run(look())
+
+
+def test_a_path_that_is_not_there_is_answered_in_json(tmp_path: Path) -> None:
+    """Mainsail reads the error's code from the body of a theme that is not there."""
+    with Server(tmp_path, config(machine("edm"))) as server:
+        for path in ("/server/files/config/.theme/default.json", "/server/nothing", "/machine/nothing"):
+            answer = server.client.request("GET", path)
+            assert answer.status == 404
+            assert answer.json["error"]["code"] == 404

@@ -2,13 +2,13 @@
 
 import re
 
-from starlette.routing import BaseRoute, WebSocketRoute
+from starlette.routing import BaseRoute, Mount, WebSocketRoute
 
 from toolpost.dialects.moonraker.connections import Connections
 from toolpost.dialects.moonraker.database import DatabaseMethods
 from toolpost.dialects.moonraker.files import FileMethods
 from toolpost.dialects.moonraker.history import HistoryMethods
-from toolpost.dialects.moonraker.http import MethodRoutes
+from toolpost.dialects.moonraker.http import MethodRoutes, not_found
 from toolpost.dialects.moonraker.identify import CONNECTION_METHODS
 from toolpost.dialects.moonraker.info import InfoMethods
 from toolpost.dialects.moonraker.job_queue import JobQueueMethods
@@ -60,6 +60,7 @@ class Moonraker:
             *self._transfer.routes(),
             MethodRoutes(self._methods, bodies),
             WebSocketRoute("/websocket", socket),
+            *(Mount(f"/{root}", app=not_found) for root in ("server", "printer", "machine", "access")),
         ]
 
     def close(self) -> None:

@@ -71,6 +71,7 @@ class FileMethods:
             Method(f"{name}.list", ("GET", f"{path}/list"), ListParams, self.list_files),
             Method(f"{name}.roots", ("GET", f"{path}/roots"), NoParams, self.roots),
             Method(f"{name}.metadata", ("GET", f"{path}/metadata"), MetadataParams, self.metadata),
+            Method(f"{name}.metascan", ("POST", f"{path}/metascan"), MetadataParams, self.metadata),
             Method(f"{name}.thumbnails", ("GET", f"{path}/thumbnails"), MetadataParams, self.thumbnails),
             Method(f"{name}.get_directory", ("GET", directory), DirectoryParams, self.get_directory),
             Method(f"{name}.post_directory", ("POST", directory), PathParams, self.post_directory),

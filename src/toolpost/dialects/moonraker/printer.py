@@ -1,5 +1,6 @@
 """The methods that make the machine do something (external_api/printer.md)."""
 
+import re
 from collections.abc import Callable
 from typing import Final
 
@@ -22,6 +23,7 @@ _OK: Final = "ok"
 _ERROR: Final = "error"
 _STOPS: Final = frozenset({"CANCEL_PRINT", "M112"})
 _RESET: Final = "SDCARD_RESET_FILE"
+_MACRO: Final = re.compile(r"[A-Z]{2,}_[A-Z0-9_]*|_[A-Z0-9_]+")
 
 
 class StartParams(msgspec.Struct, frozen=True):
@@ -96,6 +98,10 @@ class PrinterMethods:
                 if stops:
                     await self._shop.cancel(self._machine, connection.actor)
                     return _OK
+        # Half of a script is another script: one that needs a macro is not sent at all.
+        macro = next((word for word in map(_word, lines) if _MACRO.fullmatch(word) and word != _RESET), None)
+        if macro is not None:
+            problem = problem or f"this machine has no command {macro[:50]}; nothing was sent"
         if problem:
             raise RpcError(400, problem)
         for line in lines:
