@@ -8,7 +8,7 @@ import click
 import msgspec
 import uvloop
 
-from bench import latency, load, queue, stream, telemetry
+from bench import job_queue, latency, load, stream, telemetry
 from bench.result import Result, show
 
 _PARTS = ("stream", "latency", "load", "queue", "telemetry")
@@ -29,7 +29,7 @@ def main(parts: tuple[str, ...], scale: float, file: Path | None) -> None:
     if "load" in parts:
         results += uvloop.run(load.measure(scale))
     if "queue" in parts:
-        results += uvloop.run(queue.measure(scale))
+        results += uvloop.run(job_queue.measure(scale))
     if "telemetry" in parts:
         results += msgspec.convert(telemetry.measure(int(10_000_000 * scale)), list[Result])
     when = dt.datetime.now(dt.UTC).strftime("%Y-%m-%d")

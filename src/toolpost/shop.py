@@ -24,6 +24,7 @@ from toolpost.store.namespaces import NamespaceStore
 from toolpost.telemetry import Telemetry
 
 _READERS = 4
+_PROGRAMS_KNOWN = 10_000
 
 
 class Status(msgspec.Struct, frozen=True, kw_only=True):
@@ -81,6 +82,7 @@ class Shop:
         self._namespaces = store.namespaces
         self._address = address
         self._made: dict[tuple[str, str], Program] = {}
+        self._making = 0
         # Each may make a large answer: so many at a time, whatever is asked.
         self._readers = asyncio.Semaphore(_READERS)
         self._adding: dict[str, int] = dict.fromkeys(machines, 0)
@@ -340,15 +342,21 @@ class Shop:
         """
         target = self._machines[machine]
         distinct = list(dict.fromkeys(names))
-        pinned = await self._files.pin_all(distinct)
-        programs = {}
-        for name, file in zip(distinct, pinned, strict=True):
-            programs[name] = await asyncio.to_thread(self._program_of, target, name, file)
-        entries = [(name, programs[name]) for name in names]
-        if replace:
-            await target.queue.replace(entries, shown, actor)
-        else:
-            await target.queue.add(entries, actor)
+        # No program is deleted until the jobs that need it are there.
+        self._making += 1
+        try:
+            pinned = await self._files.pin_all(distinct)
+            programs = {}
+            for name, file in zip(distinct, pinned, strict=True):
+                programs[name] = await asyncio.to_thread(self._program_of, target, name, file)
+            entries = [(name, programs[name]) for name in names]
+            if replace:
+                await target.queue.replace(entries, shown, actor)
+            else:
+                await target.queue.add(entries, actor)
+        finally:
+            self._making -= 1
+        self._trim_programs()
 
     async def dequeue(self, machine: str, job_ids: Sequence[str] | None, actor: str) -> None:
         """Remove waiting jobs, all of them for None; StorageError if that could not be stored."""
@@ -382,6 +390,8 @@ class Shop:
             program = self._programs.add(_commands(target, read_lines(file.path)))
         except InvalidLineError as error:
             raise InvalidRequestError(f"{name}, line {error.index + 1}: {error.problem}") from None
+        if len(self._made) >= _PROGRAMS_KNOWN:
+            self._made.clear()
         self._made[key] = program
         return program
 
@@ -429,7 +439,7 @@ class Shop:
             return await self._telemetry.query(machine, keys, grid)
 
     def _trim_programs(self) -> None:
-        if any(self._adding.values()) or self._programs.size <= self._programs_bytes:
+        if self._making or any(self._adding.values()) or self._programs.size <= self._programs_bytes:
             return
         # Jobs that are not on disk yet, and those of machines that are not configured any more.
         in_use = {job.program for m in self._machines.values() for job in m.ledger.open}
