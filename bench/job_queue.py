@@ -1,4 +1,4 @@
-"""The job queue over Moonraker's API: its rate, what a change costs, and how soon the next job starts."""  # noqa: A005
+"""The job queue over Moonraker's API: its rate, what a change costs, and how soon the next job starts."""
 
 import asyncio
 import functools
