@@ -180,7 +180,15 @@ def measure(points: int = 10_000_000) -> list[dict[str, Any]]:
 
     def add(what: str, value: float, unit: str, goal: float | None = None) -> None:
         ok = goal is None or value <= goal
-        results.append({"what": what, "value": round(value, 4), "unit": unit, "goal": goal, "ok": ok})
+        results.append(
+            {
+                "what": what,
+                "value": round(value, 4),
+                "unit": unit,
+                "goal": "" if goal is None else f"<= {goal:g}",
+                "ok": ok,
+            }
+        )
 
     with tempfile.TemporaryDirectory(prefix="toolpost-bench-") as name:
         wrote = _child("write", Path(name), count)
@@ -223,7 +231,7 @@ def main() -> None:
         return
     results = measure(options.points)
     for row in results:
-        goal = "" if row["goal"] is None else f"goal {row['goal']:g}"
+        goal = row["goal"]
         mark = "" if row["ok"] else "MISSED"
         print(f"{row['what']:<52}{row['value']:>10.3f} {row['unit']:<5}{goal:<10}{mark}")
     if options.json:
