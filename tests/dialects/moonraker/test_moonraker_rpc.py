@@ -35,7 +35,7 @@ FAILURES = {
     "state": NotAcceptedError("a job has not ended"),
     "disk": StorageError("the disk is full"),
     "link": LinkError("the cable is out"),
-    "bug": TypeError("/root/secret.py is broken"),
+    "bug": TypeError("/srv/secret.py is broken"),
 }
 
 
