@@ -237,6 +237,8 @@ class Disk:
         monkeypatch.setattr(commlog.os, "write", self.write)
 
     def write(self, fd, data):
+        if not os.readlink(f"/proc/self/fd/{fd}").endswith(".log"):
+            return self._write(fd, data)  # Some other thread of the process writes too.
         try:
             if self.full:
                 raise OSError(errno.ENOSPC, "No space left on device")

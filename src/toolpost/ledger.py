@@ -72,7 +72,7 @@ class Ledger:
             fixed = after_restart(job, load_on_startup=load_on_startup, at_us=now_us())
             if fixed is not job:
                 self.declare(fixed)
-        self._store.trim(self._machine, self._keep_stored)
+        self._trim()
 
     def __iter__(self) -> Iterator[Job]:
         """Go through the jobs in the order of adding; those that are not on disk yet are left out."""
@@ -197,12 +197,19 @@ class Ledger:
         at_us = now_us()
         return [self.declare(job.to(state, reason, at_us), actor) for job in self.called]
 
+    def _trim(self) -> None:
+        def trimmed(future: "asyncio.Future[None]") -> None:
+            if not future.cancelled() and (error := future.exception()) is not None:
+                log.warning("%s: old jobs could not be deleted: %s", self._machine, error)
+
+        self._store.trim(self._machine, self._keep_stored).add_done_callback(trimmed)
+
     def _put_new(self, jobs: Sequence[Job]) -> None:
         for job in jobs:
             self._unsaved.add(job.seq)
             self._put(job)
         if any(job.seq % _TRIM_EVERY == 0 for job in jobs):
-            self._store.trim(self._machine, self._keep_stored)
+            self._trim()
 
     def _added(self, jobs: Sequence[Job], future: "asyncio.Future[None]") -> None:
         failed = future.cancelled() or future.exception() is not None
