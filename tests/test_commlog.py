@@ -237,7 +237,7 @@ class Disk:
         monkeypatch.setattr(commlog.os, "write", self.write)
 
     def write(self, fd, data):
-        if not os.readlink(f"/proc/self/fd/{fd}").endswith(".log"):
+        if Path(f"/proc/self/fd/{fd}").readlink().suffix != ".log":
             return self._write(fd, data)  # Some other thread of the process writes too.
         try:
             if self.full:
