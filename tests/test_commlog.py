@@ -7,6 +7,7 @@ import logging
 import os
 import re
 import time
+from pathlib import Path
 
 import pytest
 
